@@ -16,7 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self
 
+import numpy as np
+
 from ropetrace.errors import ConfigError
+from ropetrace.types import FloatArray
 
 Vector = tuple[float, float, float]
 
@@ -269,6 +272,19 @@ class RopeConfig:
             or self.segmentation.lab_min is not None
             or self.segmentation.color_pixel is not None
         )
+
+    def world_from_camera(self) -> FloatArray:
+        """The camera's pose as a (4, 4) transform; the identity where none is given."""
+        transform = np.eye(4)
+        if self.camera_pose is not None:
+            x, y, z, w = np.array(self.camera_pose[3:]) / math.hypot(*self.camera_pose[3:])
+            transform[:3, :3] = [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+            transform[:3, 3] = self.camera_pose[:3]
+        return transform
 
     def resolved(self) -> Self:
         """The same settings with everything filled in that follows from the diameter."""

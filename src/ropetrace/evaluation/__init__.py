@@ -1,0 +1,1 @@
+"""How good an estimate is, and the experiments that measure it."""

@@ -1,0 +1,1 @@
+"""Simulated recordings: scenes, a depth camera and its noise."""

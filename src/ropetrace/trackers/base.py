@@ -1,0 +1,64 @@
+"""What every tracker is: frames in, estimates out, one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ropetrace.types import Estimate, FloatArray, Frame
+
+Mask = NDArray[np.bool_] | Callable[[Frame], NDArray[np.bool_]]
+"""True where the rope is: (H, W) for an image, (N,) for a cloud; or a function that makes one of a frame."""
+
+Lap = Callable[[str], None]
+"""Called with a stage's name when the stage has ended, so that whoever owns a clock can time it."""
+
+
+def no_lap(stage: str) -> None:
+    """Times nothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """The points behind an estimate.
+
+    Parameters
+    ----------
+    points : (N, 3) float array
+        Metres, camera frame.
+    node : (N,) int32 array
+        Index of each point's node in `Estimate.nodes`; -1 for none.
+    """
+
+    points: FloatArray
+    node: NDArray[np.int32]
+
+
+class Tracker(Protocol):
+    """Turns frames into estimates. It knows nothing of files, viewers or clocks."""
+
+    def update(self, frame: Frame, lap: Lap = no_lap) -> Estimate:
+        """The estimate of one frame.
+
+        Parameters
+        ----------
+        frame : RgbdFrame or CloudFrame
+            The next frame.
+        lap : callable
+            Told of the end of each stage.
+
+        Raises
+        ------
+        FrameError
+            If the frame lacks what the settings ask for, such as colour.
+        """
+
+    def cloud(self) -> Cloud:
+        """The points of the last frame and their nodes: a copy."""
+
+    def reset(self) -> None:
+        """Forget the frames so far."""

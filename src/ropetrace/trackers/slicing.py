@@ -1,0 +1,233 @@
+"""The paper's tracker: segmentation, slicing, ordering, centreline. Each frame stands for itself.
+
+Rastegarpanah, Howard and Stolkin, "Tracking linear deformable objects using slicing method", Robotica 40 (2022).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ropetrace.centerline import chain_tangents, extend_to_tips, make_waypoints
+from ropetrace.config import RopeConfig, SegmentationConfig, parse_color
+from ropetrace.errors import FrameError
+from ropetrace.ordering import end_scores, free_space, order_greedy, order_path, runs_backwards
+from ropetrace.segmentation import ColorGate, PositionBox, Segmenter
+from ropetrace.slicing import Slicer, Slices, surface_to_axis
+from ropetrace.trackers.base import Cloud, Lap, Mask, no_lap
+from ropetrace.types import CloudFrame, Estimate, FloatArray, Frame, RgbdFrame, Status, Waypoints
+
+
+class SlicingTracker:
+    """Tracks one rope by slicing.
+
+    Parameters
+    ----------
+    config : RopeConfig
+        Settings; what is None is derived from the diameter.
+    mask : array or callable, optional
+        Replaces the colour gate; the position box still holds.
+    """
+
+    def __init__(self, config: RopeConfig, mask: Mask | None = None) -> None:
+        self.config = config.resolved()
+        self._mask = mask
+        self._segmenter = Segmenter(
+            _color_gate(self.config),
+            _position_box(self.config),
+            self.config.diameter if self.config.segmentation.reject_flying_pixels else None,
+        )
+        slicing = self.config.slicing
+        assert slicing.variance_threshold is not None
+        self._slicer = Slicer(slicing.variance_threshold, slicing.min_points, slicing.max_nodes)
+        self._points: FloatArray = np.empty((3, 0))
+        self._slices: Slices | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the frames so far."""
+        self._chain: FloatArray | None = None
+        self._waypoints: Waypoints | None = None
+        self._stamp_ns: int | None = None
+
+    def update(self, frame: Frame, lap: Lap = no_lap) -> Estimate:
+        """The estimate of one frame.
+
+        Raises
+        ------
+        FrameError
+            If colour is asked for and the frame has none, or the mask does not fit the frame.
+        """
+        reasons = self._stamp_trouble(frame.stamp_ns)
+        self._slices = None
+
+        points, count, stride = self._rope_points(frame)
+        lap("segmentation")
+        if count == 0:
+            return Estimate.lost(frame.stamp_ns, "no points of the rope's colour and place")
+        if stride > 1:
+            reasons.append(f"{count} points passed, every {stride}th is used: narrow the colour or the position box")
+
+        slices = self._slicer.slice(points)
+        lap("slicing")
+        if slices.capped:
+            reasons.append(
+                f"more than {self._slicer.max_nodes} slices: background is taken for rope, or the diameter is too small"
+            )
+        if len(slices) < 2:
+            return Estimate.lost(frame.stamp_ns, _too_little(points.shape[1], len(slices)), count)
+
+        slices, trouble = self._in_order(slices)
+        reasons += trouble
+        lap("ordering")
+        if len(slices) < 2:
+            return Estimate.lost(frame.stamp_ns, "the points do not hang together", count)
+
+        tangents = chain_tangents(slices.centroids)
+        nodes = self._axis_points(slices.centroids, tangents)
+        chain = extend_to_tips(nodes, chain_tangents(nodes), _reach(slices, tangents))
+        assert self.config.centerline.spacing is not None
+        waypoints = make_waypoints(chain, self.config.centerline.spacing, self._waypoints)
+        lap("centerline")
+
+        self._slices, self._chain, self._waypoints = slices, slices.centroids, waypoints
+        status = Status.DEGRADED if reasons else Status.OK
+        return Estimate(frame.stamp_ns, status, tuple(reasons), nodes, waypoints, count, stride)
+
+    def cloud(self) -> Cloud:
+        """The points of the last frame and their nodes: a copy."""
+        node = np.full(self._points.shape[1], -1, np.int32)
+        if self._slices is not None:
+            for index, (start, count) in enumerate(zip(self._slices.starts, self._slices.counts, strict=True)):
+                node[self._slices.point_order[start : start + count]] = index
+        return Cloud(self._points.T.copy(), node)
+
+    def _stamp_trouble(self, stamp_ns: int) -> list[str]:
+        previous, self._stamp_ns = self._stamp_ns, stamp_ns
+        if previous is None or stamp_ns > previous:
+            return []
+        if stamp_ns == previous:
+            return ["the stamp repeats that of the frame before"]
+        return [f"the stamp runs back by {(previous - stamp_ns) / 1e9:.3f} s"]
+
+    def _rope_points(self, frame: Frame) -> tuple[FloatArray, int, int]:
+        """The points to use, (3, N); how many there were; and the stride that took these from them."""
+        mask = self._mask(frame) if callable(self._mask) else self._mask
+        shape = frame.depth.shape if isinstance(frame, RgbdFrame) else (len(frame.points),)
+        if mask is not None and (mask.shape != shape or mask.dtype != np.bool_):
+            raise FrameError(f"the mask is {mask.dtype} of shape {mask.shape}: expected bool of shape {shape}")
+        if mask is None and self.config.asks_for_color:
+            self._require_color(frame)
+        found = self._segmenter.segment(frame, mask)
+        count = found.shape[1]
+        stride = -(-count // self.config.slicing.max_points) if count else 1
+        self._points = found if stride == 1 else np.ascontiguousarray(found[:, ::stride])
+        return self._points, count, stride
+
+    def _require_color(self, frame: Frame) -> None:
+        color = frame.colors if isinstance(frame, CloudFrame) else frame.color
+        if color is None:
+            raise FrameError("a colour is asked for, but the frame has none: leave out the colour, or record it")
+        pixel = self.config.segmentation.color_pixel
+        if self._segmenter.gate is None and pixel is not None:
+            if color.ndim != 3:
+                raise FrameError("segmentation.color_pixel needs images; this is a point cloud")
+            column, row = pixel
+            if row >= color.shape[0] or column >= color.shape[1]:
+                raise FrameError(
+                    f"segmentation.color_pixel = {pixel} lies outside the {color.shape[1]}x{color.shape[0]} image"
+                )
+            patch = color[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].reshape(-1, 3)
+            r, g, b = (int(value) for value in np.median(patch, axis=0))
+            # The pixel may lie in the rope's shade, so brighter ones must pass as well.
+            self._segmenter.gate = ColorGate.around_color(
+                (r, g, b), self.config.segmentation.color_tolerance, brightest=3.0
+            )
+
+    def _in_order(self, slices: Slices) -> tuple[Slices, list[str]]:
+        """The slices along the rope from its start, without those that do not belong to it, and what to mistrust."""
+        ordering = self.config.ordering
+        if ordering.method == "greedy":
+            scores = end_scores(slices.centroids, ordering.first_point)
+            order = order_greedy(slices.centroids, int(np.argmax(scores)))
+        else:
+            order = order_path(slices.centroids, slices.covariances)
+        slices = slices.kept(order)
+        gaps = free_space(slices.centroids, slices.covariances)
+        assert ordering.max_gap is not None
+        trouble = []
+        ends = np.flatnonzero(gaps > ordering.max_gap) + 1
+        if len(ends):
+            pieces = np.split(np.arange(len(slices)), ends)
+            longest = max(pieces, key=lambda piece: int(slices.counts[piece].sum()))
+            trouble.append(
+                f"{len(slices) - len(longest)} of {len(slices)} nodes lie beyond a gap of "
+                f"{gaps[ends - 1].min() * 1e3:.0f} mm and are left out: something else of that colour, or a hidden part"
+            )
+            slices, gaps = slices.kept(longest), free_space(slices.centroids[longest], slices.covariances[longest])
+        bridged = gaps.max(initial=0.0)
+        if bridged > BRIDGE_DIAMETERS * self.config.diameter:
+            trouble.append(f"a gap of {bridged * 1e3:.0f} mm is bridged")
+        if _is_surface(slices.centroids):
+            trouble.append("the points form a surface, not a rope: background passes the colour or the position box")
+        if len(slices) > 1 and self._runs_backwards(slices.centroids):
+            slices = slices.kept(np.arange(len(slices))[::-1])
+        return slices, trouble
+
+    def _runs_backwards(self, chain: FloatArray) -> bool:
+        if self.config.ordering.follow_previous and self._chain is not None:
+            return runs_backwards(chain, self._chain)
+        scores = end_scores(chain, self.config.ordering.first_point)
+        return bool(scores[-1] > scores[0])
+
+    def _axis_points(self, centroids: FloatArray, tangents: FloatArray) -> FloatArray:
+        if self.config.slicing.surface_offset is not None:
+            return centroids + np.array(self.config.slicing.surface_offset)
+        return surface_to_axis(centroids, tangents, self.config.radius)
+
+
+BRIDGE_DIAMETERS = 5.0
+"""A gap of more diameters than this in the chain is worth telling."""
+
+
+def _reach(slices: Slices, tangents: FloatArray) -> tuple[float, float]:
+    """How far the first and the last slice go on beyond their centroids: half the length of an even spread, metres."""
+    first = tangents[0] @ slices.covariances[0] @ tangents[0]
+    last = tangents[-1] @ slices.covariances[-1] @ tangents[-1]
+    return float(np.sqrt(3 * max(first, 0.0))), float(np.sqrt(3 * max(last, 0.0)))
+
+
+def _too_little(points: int, slices: int) -> str:
+    if slices == 1 and points >= 20:
+        return f"{points} points make a single slice: the diameter (or slicing.variance_threshold) is too large for them"
+    return f"too few points ({points})"
+
+
+def _is_surface(centroids: FloatArray) -> bool:
+    """Whether nodes have neighbours all round, as on a wall, where a rope's have two."""
+    if len(centroids) < 8:
+        return False
+    distances = np.linalg.norm(centroids[:, None] - centroids[None], axis=2)
+    np.fill_diagonal(distances, np.inf)
+    reach = 1.7 * np.median(distances.min(axis=1))
+    neighbours: NDArray[np.int64] = (distances < reach).sum(axis=1)
+    return bool(np.median(neighbours) >= 4)
+
+
+def _color_gate(config: RopeConfig) -> ColorGate | None:
+    segmentation: SegmentationConfig = config.segmentation
+    if config.color is not None:
+        return ColorGate.around_color(parse_color(config.color), segmentation.color_tolerance)
+    if segmentation.lab_min is not None and segmentation.lab_max is not None:
+        return ColorGate.inside_lab_box(segmentation.lab_min, segmentation.lab_max)
+    return None
+
+
+def _position_box(config: RopeConfig) -> PositionBox | None:
+    segmentation = config.segmentation
+    if segmentation.box_min is None or segmentation.box_max is None:
+        return None
+    low, high = np.array(segmentation.box_min), np.array(segmentation.box_max)
+    if segmentation.box_frame == "camera":
+        return PositionBox(low, high)
+    return PositionBox(low, high, config.world_from_camera())
