@@ -7,6 +7,7 @@ paper's rule.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,72 +25,68 @@ TURN_COST = 1.5
 _EASY = 2.0
 """A joint between neighbours that costs less than this is not worth undoing."""
 
+_TOUCH = 0.2
+"""Slices touch where less than this part of their distance is free space."""
+
 _LONGEST_MOVE = 3
 """Nodes that the search moves together."""
 
 Indices = NDArray[np.int64]
 
 
-def order_path(centroids: FloatArray, covariances: FloatArray) -> Indices:
-    """The open chain of least cost through all nodes.
-
-    The cost of an edge is its length plus `GAP_COST` times the free space in it, in units of the median distance to
-    the nearest node; a slice fills sqrt(3) of its standard deviation to each side, as an even spread of points does.
-    A turn by t costs `TURN_COST` (1 - cos t)^2. The search starts from the cheapest edges, as Kruskal's algorithm
-    picks them, and exchanges edges and moves nodes (2-opt and or-opt) until nothing is gained.
+@dataclass(frozen=True, slots=True, eq=False)
+class NodeGraph:
+    """What it takes to go from each node to each other.
 
     Parameters
     ----------
-    centroids : (M, 3) float array
-        Metres.
-    covariances : (M, 3, 3) float array
-        Covariance of each slice's points, m^2.
+    gaps : (M, M) float array
+        Free space between two slices, metres: their distance less what they fill, at least 0. A slice fills sqrt(3)
+        of its standard deviation to each side, as an even spread of points does.
+    costs : (M, M) float array
+        Distance plus `GAP_COST` times the gap, in units of the median distance to the nearest node.
+    directions : (M, M, 3) float array
+        Unit vectors from node to node.
+    touching : (M,) int array
+        How many others each slice touches: 2 on a rope, more on a surface.
+    """
+
+    gaps: FloatArray
+    costs: FloatArray
+    directions: FloatArray
+    touching: Indices
+
+    @classmethod
+    def of(cls, centroids: FloatArray, covariances: FloatArray) -> NodeGraph:
+        """The graph of slices with (M, 3) centroids, metres, and (M, 3, 3) covariances, m^2."""
+        count = len(centroids)
+        graph = cls(
+            np.empty((count, count)),
+            np.empty((count, count)),
+            np.empty((count, count, 3)),
+            np.zeros(count, np.int64),
+        )
+        _fill_graph(centroids, covariances, graph.gaps, graph.costs, graph.directions, graph.touching)
+        return graph
+
+
+def order_path(graph: NodeGraph) -> Indices:
+    """The open chain of least cost through all nodes.
+
+    To the costs of the edges comes `TURN_COST` (1 - cos t)^2 for a turn by t. The search starts from the cheapest
+    edges, as Kruskal's algorithm picks them, and exchanges edges and moves nodes (2-opt and or-opt) until nothing is
+    gained.
 
     Returns
     -------
     (M,) int array
         Indices of the nodes along the rope, from either end.
     """
-    count = len(centroids)
-    if count < 3:
-        return np.arange(count)
-    costs, directions = edge_costs(centroids, covariances)
-    path = np.empty(count, np.int64)
-    _link(costs, path)
-    _improve(costs, directions, path)
+    path = np.arange(len(graph.touching))
+    if len(path) > 2:
+        _link(graph.costs, path)
+        _improve(graph.costs, graph.directions, path)
     return path
-
-
-def edge_costs(centroids: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cost of joining each two nodes, (M, M), and the unit vectors between them, (M, M, 3)."""
-    count = len(centroids)
-    costs = np.empty((count, count))
-    directions = np.empty((count, count, 3))
-    _edges(np.ascontiguousarray(centroids), np.ascontiguousarray(covariances), costs, directions)
-    return costs, directions
-
-
-def free_space(centroids: FloatArray, covariances: FloatArray) -> FloatArray:
-    """The free space between neighbours of a chain: their distance less what their slices fill, at least 0.
-
-    Parameters
-    ----------
-    centroids : (M, 3) float array
-        In order, metres.
-    covariances : (M, 3, 3) float array
-        m^2.
-
-    Returns
-    -------
-    (M - 1,) float array
-        Metres.
-    """
-    steps = np.diff(centroids, axis=0)
-    sizes = np.linalg.norm(steps, axis=1)
-    units = steps / np.maximum(sizes, 1e-12)[:, None]
-    before = np.sqrt(np.maximum(3 * np.einsum("mi,mij,mj->m", units, covariances[:-1], units), 0))
-    after = np.sqrt(np.maximum(3 * np.einsum("mi,mij,mj->m", units, covariances[1:], units), 0))
-    return np.maximum(sizes - before - after, 0)
 
 
 def order_greedy(centroids: FloatArray, start: int) -> Indices:
@@ -159,51 +156,74 @@ def runs_backwards(chain: FloatArray, previous: FloatArray) -> bool:
     chain, previous : (M, 3) and (K, 3) float arrays
         Nodes in order, metres.
     """
-    here, before = _sampled(chain), _sampled(previous)
-    forwards = np.linalg.norm(here - before, axis=1).sum()
-    backwards = np.linalg.norm(here[::-1] - before, axis=1).sum()
-    return bool(backwards < forwards)
-
-
-def _sampled(chain: FloatArray, count: int = 9) -> FloatArray:
-    """Points at equal parts of a polyline's length."""
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(chain, axis=0), axis=1))])
-    places = np.linspace(0, length[-1], count)
-    return np.stack([np.interp(places, length, chain[:, axis]) for axis in range(3)], axis=1)
+    return bool(_runs_backwards(chain, previous))
 
 
 @njit(cache=True, nogil=True)
-def _edges(centroids: Any, covariances: Any, costs: Any, directions: Any) -> None:
+def _runs_backwards(chain: Any, previous: Any) -> bool:
+    here, before = _sampled(chain), _sampled(previous)
+    forwards = backwards = 0.0
+    for index in range(len(here)):
+        forwards += np.sqrt(np.sum((here[index] - before[index]) ** 2))
+        backwards += np.sqrt(np.sum((here[len(here) - 1 - index] - before[index]) ** 2))
+    return backwards < forwards
+
+
+@njit(cache=True, nogil=True)
+def _sampled(chain: Any) -> Any:
+    """Nine points at equal parts of a polyline's length."""
+    length = np.zeros(len(chain))
+    for index in range(1, len(chain)):
+        length[index] = length[index - 1] + np.sqrt(np.sum((chain[index] - chain[index - 1]) ** 2))
+    points = np.empty((9, 3))
+    places = np.linspace(0.0, length[-1], 9)
+    for axis in range(3):
+        points[:, axis] = np.interp(places, length, np.ascontiguousarray(chain[:, axis]))
+    return points
+
+
+@njit(cache=True, nogil=True)
+def _gap(a: Any, b: Any, covariance_a: Any, covariance_b: Any, unit: Any) -> Any:
+    """Distance of two slices, and the free space in it; fills in the unit vector from a to b."""
+    size = 0.0
+    for k in range(3):
+        unit[k] = b[k] - a[k]
+        size += unit[k] * unit[k]
+    size = np.sqrt(size)
+    for k in range(3):
+        unit[k] = unit[k] / size if size > 0 else 0.0
+    spread_a = spread_b = 0.0
+    for k in range(3):
+        for m in range(3):
+            spread_a += unit[k] * covariance_a[k, m] * unit[m]
+            spread_b += unit[k] * covariance_b[k, m] * unit[m]
+    return size, max(0.0, size - np.sqrt(max(3 * spread_a, 0.0)) - np.sqrt(max(3 * spread_b, 0.0)))
+
+
+@njit(cache=True, nogil=True)
+def _fill_graph(centroids: Any, covariances: Any, gaps: Any, costs: Any, directions: Any, touching: Any) -> None:
     count = len(centroids)
     nearest = np.full(count, np.inf)
-    gaps = np.zeros((count, count))
     unit = np.empty(3)
     for i in range(count):
-        costs[i, i] = np.inf
+        gaps[i, i] = costs[i, i] = np.inf
         directions[i, i] = 0.0
         for j in range(i):
-            size = 0.0
+            size, gap = _gap(centroids[i], centroids[j], covariances[i], covariances[j], unit)
             for k in range(3):
-                unit[k] = centroids[j, k] - centroids[i, k]
-                size += unit[k] * unit[k]
-            size = np.sqrt(size)
-            for k in range(3):
-                unit[k] = unit[k] / size if size > 0 else 0.0
                 directions[i, j, k] = unit[k]
                 directions[j, i, k] = -unit[k]
-            spread_i = spread_j = 0.0
-            for k in range(3):
-                for m in range(3):
-                    spread_i += unit[k] * covariances[i, k, m] * unit[m]
-                    spread_j += unit[k] * covariances[j, k, m] * unit[m]
-            costs[i, j] = size
-            gaps[i, j] = max(0.0, size - np.sqrt(max(3 * spread_i, 0.0)) - np.sqrt(max(3 * spread_j, 0.0)))
+            gaps[i, j] = gaps[j, i] = gap
+            costs[i, j] = size + GAP_COST * gap
             nearest[i] = min(nearest[i], size)
             nearest[j] = min(nearest[j], size)
+            if gap < _TOUCH * size:
+                touching[i] += 1
+                touching[j] += 1
     scale = max(np.median(nearest), 1e-9)
     for i in range(count):
         for j in range(i):
-            costs[i, j] = (costs[i, j] + GAP_COST * gaps[i, j]) / scale
+            costs[i, j] /= scale
             costs[j, i] = costs[i, j]
 
 

@@ -116,31 +116,81 @@ class Slicer:
         return slices.kept(slices.counts >= max(2.0, np.median(slices.counts) / 4)) if parts else slices
 
 
-def surface_to_axis(centroids: FloatArray, tangents: FloatArray, radius: float) -> FloatArray:
-    """Points on the rope's axis below the centroids of its visible surface (equation 11, from the geometry).
+def axis_points(
+    centroids: FloatArray,
+    covariances: FloatArray,
+    tangents: FloatArray,
+    radius: float,
+    surface_offset: tuple[float, float, float] | None = None,
+) -> FloatArray:
+    """Points on the rope's axis below the centroids of ordered slices of its visible surface (equation 11).
 
-    Seen from the camera, the visible half of a cylinder of radius r has a mean depth of r pi/4 before the axis: each
-    centroid moves by that along its own ray, made perpendicular to the rope.
+    Two things keep a centroid off the axis. The mean of a bent slice lies inside the bend: for a slice whose points
+    have the variance s^2 along the rope, by s^2/2 times the curve's second derivative, which is taken back. And the
+    camera sees the near side only: the centroid moves away from the camera, across the rope, by the mean depth of the
+    visible surface before the axis. For a cylinder of radius r seen to a half-width of w that is
+    (sqrt(r^2 - w^2) + r^2/w asin(w/r)) / 2, which is r pi/4 where all of it is seen (w = r); w follows from the
+    slice's variance across the rope, w^2/3, so that lost edges and coarse pixels do not bias it.
 
     Parameters
     ----------
     centroids : (M, 3) float array
-        Metres, camera frame.
+        In order along the rope, M >= 2, metres, camera frame.
+    covariances : (M, 3, 3) float array
+        Of the slices' points, m^2.
     tangents : (M, 3) float array
         Unit vectors along the rope.
     radius : float
-        Metres.
+        Of the rope, metres.
+    surface_offset : (x, y, z), optional
+        The paper's constant vector v_c, added in the place of all this, metres.
 
     Returns
     -------
     (M, 3) float array
     """
-    rays = centroids / np.linalg.norm(centroids, axis=1, keepdims=True)
-    across = rays - tangents * np.sum(rays * tangents, axis=1, keepdims=True)
-    size = np.linalg.norm(across, axis=1, keepdims=True)
-    # Where the rope points at the camera there is no such direction, and no visible half either.
-    away = np.where(size > 0.1, across / np.maximum(size, 0.1), across / 0.1)
-    return centroids + np.pi / 4 * radius * away
+    if surface_offset is not None:
+        return centroids + np.array(surface_offset)
+    nodes = np.empty_like(centroids)
+    _axis_points(centroids, covariances, tangents, radius, nodes)
+    return nodes
+
+
+@njit(cache=True, nogil=True)
+def _axis_points(centroids: Any, covariances: Any, tangents: Any, radius: float, nodes: Any) -> None:
+    count = len(centroids)
+    away = np.empty(3)
+    for m in range(count):
+        c, t = centroids[m], tangents[m]
+        size = np.sqrt(c[0] * c[0] + c[1] * c[1] + c[2] * c[2])
+        slope = (c[0] * t[0] + c[1] * t[1] + c[2] * t[2]) / max(size, 1e-9)
+        for k in range(3):
+            away[k] = c[k] / max(size, 1e-9) - slope * t[k]
+        # Where the rope points at the camera it has no visible half to correct for: fade out.
+        sine = max(np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2), 0.1)
+        for k in range(3):
+            away[k] /= sine
+        sx, sy, sz = t[1] * away[2] - t[2] * away[1], t[2] * away[0] - t[0] * away[2], t[0] * away[1] - t[1] * away[0]
+        v = covariances[m]
+        across = sx * sx * v[0, 0] + sy * sy * v[1, 1] + sz * sz * v[2, 2]
+        across += 2 * (sx * sy * v[0, 1] + sx * sz * v[0, 2] + sy * sz * v[1, 2])
+        along = t[0] * t[0] * v[0, 0] + t[1] * t[1] * v[1, 1] + t[2] * t[2] * v[2, 2]
+        along += 2 * (t[0] * t[1] * v[0, 1] + t[0] * t[2] * v[0, 2] + t[1] * t[2] * v[1, 2])
+        seen = min(np.sqrt(max(3 * across, 0.0)) / radius, 1.0)
+        depth = radius * (0.5 * (np.sqrt(1 - seen * seen) + np.arcsin(seen) / seen) if seen > 1e-3 else 1.0)
+        before = after = 1.0
+        if 0 < m < count - 1:
+            before, after = _distance(centroids[m - 1], c), _distance(c, centroids[m + 1])
+        for k in range(3):
+            nodes[m, k] = c[k] + depth * away[k]
+            if 0 < m < count - 1:
+                bend = 2 * ((centroids[m + 1, k] - c[k]) / after - (c[k] - centroids[m - 1, k]) / before)
+                nodes[m, k] -= 0.5 * along * bend / (before + after)
+
+
+@njit(cache=True, nogil=True)
+def _distance(a: Any, b: Any) -> float:
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})

@@ -6,14 +6,13 @@ Rastegarpanah, Howard and Stolkin, "Tracking linear deformable objects using sli
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ropetrace.centerline import chain_tangents, extend_to_tips, make_waypoints
 from ropetrace.config import RopeConfig, SegmentationConfig, parse_color
 from ropetrace.errors import FrameError
-from ropetrace.ordering import end_scores, free_space, order_greedy, order_path, runs_backwards
+from ropetrace.ordering import NodeGraph, end_scores, order_greedy, order_path, runs_backwards
 from ropetrace.segmentation import ColorGate, PositionBox, Segmenter
-from ropetrace.slicing import Slicer, Slices, surface_to_axis
+from ropetrace.slicing import Slicer, Slices, axis_points
 from ropetrace.trackers.base import Cloud, Lap, Mask, no_lap
 from ropetrace.types import CloudFrame, Estimate, FloatArray, Frame, RgbdFrame, Status, Waypoints
 
@@ -84,8 +83,10 @@ class SlicingTracker:
             return Estimate.lost(frame.stamp_ns, "the points do not hang together", count)
 
         tangents = chain_tangents(slices.centroids)
-        nodes = self._axis_points(slices.centroids, tangents)
-        chain = extend_to_tips(nodes, chain_tangents(nodes), _reach(slices, tangents))
+        nodes = axis_points(
+            slices.centroids, slices.covariances, tangents, self.config.radius, self.config.slicing.surface_offset
+        )
+        chain = extend_to_tips(nodes, _reach(slices, tangents))
         assert self.config.centerline.spacing is not None
         waypoints = make_waypoints(chain, self.config.centerline.spacing, self._waypoints)
         lap("centerline")
@@ -147,29 +148,31 @@ class SlicingTracker:
     def _in_order(self, slices: Slices) -> tuple[Slices, list[str]]:
         """The slices along the rope from its start, without those that do not belong to it, and what to mistrust."""
         ordering = self.config.ordering
+        graph = NodeGraph.of(slices.centroids, slices.covariances)
         if ordering.method == "greedy":
-            scores = end_scores(slices.centroids, ordering.first_point)
-            order = order_greedy(slices.centroids, int(np.argmax(scores)))
+            order = order_greedy(
+                slices.centroids, int(np.argmax(end_scores(slices.centroids, ordering.first_point)))
+            )
         else:
-            order = order_path(slices.centroids, slices.covariances)
-        slices = slices.kept(order)
-        gaps = free_space(slices.centroids, slices.covariances)
+            order = order_path(graph)
+        gaps = graph.gaps[order[:-1], order[1:]]
         assert ordering.max_gap is not None
         trouble = []
-        ends = np.flatnonzero(gaps > ordering.max_gap) + 1
-        if len(ends):
-            pieces = np.split(np.arange(len(slices)), ends)
+        if gaps.max() > ordering.max_gap:
+            ends = np.flatnonzero(gaps > ordering.max_gap)
+            pieces = np.split(order, ends + 1)
             longest = max(pieces, key=lambda piece: int(slices.counts[piece].sum()))
             trouble.append(
-                f"{len(slices) - len(longest)} of {len(slices)} nodes lie beyond a gap of "
-                f"{gaps[ends - 1].min() * 1e3:.0f} mm and are left out: something else of that colour, or a hidden part"
+                f"{len(order) - len(longest)} of {len(order)} nodes lie beyond a gap of "
+                f"{gaps[ends].min() * 1e3:.0f} mm and are left out: something else of that colour, or a hidden part"
             )
-            slices, gaps = slices.kept(longest), free_space(slices.centroids[longest], slices.covariances[longest])
+            order, gaps = longest, graph.gaps[longest[:-1], longest[1:]]
         bridged = gaps.max(initial=0.0)
         if bridged > BRIDGE_DIAMETERS * self.config.diameter:
             trouble.append(f"a gap of {bridged * 1e3:.0f} mm is bridged")
-        if _is_surface(slices.centroids):
+        if np.median(graph.touching) >= _SURFACE_NEIGHBOURS:
             trouble.append("the points form a surface, not a rope: background passes the colour or the position box")
+        slices = slices.kept(order)
         if len(slices) > 1 and self._runs_backwards(slices.centroids):
             slices = slices.kept(np.arange(len(slices))[::-1])
         return slices, trouble
@@ -180,14 +183,12 @@ class SlicingTracker:
         scores = end_scores(chain, self.config.ordering.first_point)
         return bool(scores[-1] > scores[0])
 
-    def _axis_points(self, centroids: FloatArray, tangents: FloatArray) -> FloatArray:
-        if self.config.slicing.surface_offset is not None:
-            return centroids + np.array(self.config.slicing.surface_offset)
-        return surface_to_axis(centroids, tangents, self.config.radius)
-
 
 BRIDGE_DIAMETERS = 5.0
 """A gap of more diameters than this in the chain is worth telling."""
+
+_SURFACE_NEIGHBOURS = 4
+"""Where the typical slice touches this many others, the points are a wall or a table, not a rope."""
 
 
 def _reach(slices: Slices, tangents: FloatArray) -> tuple[float, float]:
@@ -201,17 +202,6 @@ def _too_little(points: int, slices: int) -> str:
     if slices == 1 and points >= 20:
         return f"{points} points make a single slice: the diameter (or slicing.variance_threshold) is too large for them"
     return f"too few points ({points})"
-
-
-def _is_surface(centroids: FloatArray) -> bool:
-    """Whether nodes have neighbours all round, as on a wall, where a rope's have two."""
-    if len(centroids) < 8:
-        return False
-    distances = np.linalg.norm(centroids[:, None] - centroids[None], axis=2)
-    np.fill_diagonal(distances, np.inf)
-    reach = 1.7 * np.median(distances.min(axis=1))
-    neighbours: NDArray[np.int64] = (distances < reach).sum(axis=1)
-    return bool(np.median(neighbours) >= 4)
 
 
 def _color_gate(config: RopeConfig) -> ColorGate | None:
