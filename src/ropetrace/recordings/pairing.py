@@ -1,0 +1,101 @@
+"""Which colour image belongs to which depth image: the nearest stamp, within a bound."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Generic, TypeVar
+
+BUFFERED = 64
+"""Messages of each stream that wait for their partner at most."""
+
+BUFFERED_BYTES = 256 * 2**20
+"""Bytes of each stream that wait for their partner at most."""
+
+Depth = TypeVar("Depth")
+Color = TypeVar("Color")
+
+
+def nearest(stamps_ns: Sequence[int], stamp_ns: int) -> int | None:
+    """The index of the stamp nearest to `stamp_ns` in a rising sequence; the earlier of two equally near."""
+    if not stamps_ns:
+        return None
+    right = bisect_left(stamps_ns, stamp_ns)
+    if right == 0:
+        return 0
+    if right == len(stamps_ns) or stamp_ns - stamps_ns[right - 1] <= stamps_ns[right] - stamp_ns:
+        return right - 1
+    return right
+
+
+def missing_color(gap_ns: int | None, max_gap_ns: int) -> str:
+    """Why a depth image has no colour, for people."""
+    found = "there is none" if gap_ns is None else f"the nearest is {gap_ns / 1e6:g} ms away"
+    return f"no colour image within {max_gap_ns / 1e6:g} ms of this depth image ({found})"
+
+
+class Pairing(Generic[Depth, Color]):
+    """Pairs two streams that arrive interleaved, in buffers of bounded size.
+
+    A depth image waits until a colour image of its own stamp or a later one has come (then no nearer one can
+    follow), until the buffer is full, or until the stream ends. Depth images leave in the order in which they
+    came. Where the clock is set back, images from before are not paired with images from after.
+
+    Parameters
+    ----------
+    max_gap_ns : int
+        Stamps farther apart than this are not paired, nanoseconds.
+    """
+
+    def __init__(self, max_gap_ns: int) -> None:
+        self._max_gap_ns = max_gap_ns
+        self._depths: deque[tuple[int, Depth, int]] = deque()
+        self._colors: deque[tuple[int, Color, int]] = deque()
+        self._last_depth_ns: int | None = None
+
+    def add_color(self, stamp_ns: int, color: Color, size: int) -> Iterator[tuple[int, Depth, Color | str]]:
+        """Take a colour image of `size` bytes; yields what can leave."""
+        if self._colors and stamp_ns < self._colors[-1][0] - self._max_gap_ns:
+            yield from self.finish()
+            self._colors.clear()
+        self._colors.append((stamp_ns, color, size))
+        yield from self._leaving()
+        while _overfull(self._colors):
+            self._colors.popleft()
+
+    def add_depth(self, stamp_ns: int, depth: Depth, size: int) -> Iterator[tuple[int, Depth, Color | str]]:
+        """Take a depth image of `size` bytes; yields stamp, depth, and colour or why there is none."""
+        if self._last_depth_ns is not None and stamp_ns < self._last_depth_ns - self._max_gap_ns:
+            yield from self.finish()
+            # Colour may have seen the clock go back before depth did; then it is of the new time already.
+            if self._colors and self._colors[-1][0] > stamp_ns + self._max_gap_ns:
+                self._colors.clear()
+        self._last_depth_ns = stamp_ns
+        self._depths.append((stamp_ns, depth, size))
+        yield from self._leaving()
+
+    def finish(self) -> Iterator[tuple[int, Depth, Color | str]]:
+        """No more will come; yields what is left."""
+        while self._depths:
+            yield self._leave()
+
+    def _leaving(self) -> Iterator[tuple[int, Depth, Color | str]]:
+        while self._depths:
+            stamp = self._depths[0][0]
+            if not _overfull(self._depths) and not any(color[0] >= stamp for color in self._colors):
+                return
+            yield self._leave()
+
+    def _leave(self) -> tuple[int, Depth, Color | str]:
+        stamp, depth, _ = self._depths.popleft()
+        best = min(self._colors, key=lambda color: abs(color[0] - stamp), default=None)
+        gap = None if best is None else abs(best[0] - stamp)
+        if best is None or gap is None or gap > self._max_gap_ns:
+            return stamp, depth, missing_color(gap, self._max_gap_ns)
+        return stamp, depth, best[1]
+
+
+def _overfull(buffer: Iterable[tuple[int, object, int]]) -> bool:
+    sizes = [size for _, _, size in buffer]
+    return len(sizes) > BUFFERED or (len(sizes) > 1 and sum(sizes) > BUFFERED_BYTES)
