@@ -30,7 +30,7 @@ DISTANCE = 1.25
 
 
 def true_curves(rope: int, sequence: int, every: int) -> tuple[FloatArray, FloatArray]:
-    """Times, and the true curve at each, (F, K, 3), in the frame of a camera that looks at the rope's middle along y."""
+    """Times, and the true curve at each, (F, K, 3), for a camera that looks at the rope's middle along y."""
     pack = np.load(DATA / "deform_mocap" / f"DLO{rope}_clean.npz")
     markers = pack["markers"][sequence][::every].astype(float)
     places = np.linalg.norm(np.diff(markers, axis=1), axis=2).mean(axis=0)

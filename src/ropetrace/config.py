@@ -164,9 +164,7 @@ class SlicingConfig:
             self.surface_offset is None or (_finite(*self.surface_offset) and max(map(abs, self.surface_offset)) < 1),
             f"slicing.surface_offset = {self.surface_offset}: expected x, y, z in metres",
         )
-        _require(
-            4 <= self.max_nodes <= 4096, f"slicing.max_nodes = {self.max_nodes}: expected 4 to 4096"
-        )
+        _require(4 <= self.max_nodes <= 4096, f"slicing.max_nodes = {self.max_nodes}: expected 4 to 4096")
         _require(
             100 <= self.max_points <= 10_000_000,
             f"slicing.max_points = {self.max_points}: expected 100 to 10 000 000",
@@ -268,9 +266,7 @@ class RopeConfig:
     def asks_for_color(self) -> bool:
         """Whether the frames must have colour."""
         return (
-            self.color is not None
-            or self.segmentation.lab_min is not None
-            or self.segmentation.color_pixel is not None
+            self.color is not None or self.segmentation.lab_min is not None or self.segmentation.color_pixel is not None
         )
 
     def world_from_camera(self) -> FloatArray:
@@ -355,7 +351,7 @@ def default_variance_threshold(diameter: float) -> float:
 
 
 SLICE_LENGTH = 2.5
-"""Longest slice, in diameters. Much shorter, and noise turns the cuts along the rope; longer, and bends are cut short."""
+"""Longest slice, in diameters. Much shorter, and noise turns cuts along the rope; longer, and bends are cut short."""
 
 
 def _toml_value(value: Any) -> str:
@@ -387,9 +383,7 @@ def _from_table(cls: type[Any], table: dict[str, Any], where: str) -> Any:
     missing = [
         name
         for name, item in known.items()
-        if item.default is dataclasses.MISSING
-        and item.default_factory is dataclasses.MISSING
-        and name not in values
+        if item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING and name not in values
     ]
     if missing:
         raise ConfigError(f"{where}{missing[0]} is missing")
@@ -426,8 +420,7 @@ def _converted(value: Any, hint: Any, is_length: bool, name: str) -> Any:
         if origin is tuple:
             if isinstance(value, (list, tuple)) and len(value) == len(arguments):
                 return tuple(
-                    _converted(item, argument, is_length, name)
-                    for item, argument in zip(value, arguments, strict=True)
+                    _converted(item, argument, is_length, name) for item, argument in zip(value, arguments, strict=True)
                 )
             raise ConfigError(f"{name} = {value!r}: expected {len(arguments)} numbers in brackets")
         if option is bool and isinstance(value, bool):

@@ -49,5 +49,5 @@ def import_extra(module: str, extra: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError as error:
         raise MissingExtraError(
-            f"this needs the package {module.split('.')[0]!r} ({error}): pip install 'ropetrace[{extra}]'"
+            f"this needs the package {module.partition('.')[0]!r} ({error}): pip install 'ropetrace[{extra}]'"
         ) from error

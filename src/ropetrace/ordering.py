@@ -315,9 +315,7 @@ def _exchange(costs: Any, directions: Any, path: Any) -> bool:
     count = len(path)
     joints = np.zeros(count + 1)
     for at in range(1, count):
-        joints[at] = _joint(
-            costs, directions, _at(path, at - 2), path[at - 1], path[at], _at(path, at + 1)
-        )
+        joints[at] = _joint(costs, directions, _at(path, at - 2), path[at - 1], path[at], _at(path, at + 1))
     best, best_first, best_last = -1e-9, -1, -1
     for first in range(count - 1):
         for last in range(first + 1, count):
@@ -325,12 +323,8 @@ def _exchange(costs: Any, directions: Any, path: Any) -> bool:
             if before < _EASY or (joints[first] < _EASY and joints[last + 1] < _EASY):
                 continue
             gain = (
-                _joint(
-                    costs, directions, _at(path, first - 2), _at(path, first - 1), path[last], path[last - 1]
-                )
-                + _joint(
-                    costs, directions, path[first + 1], path[first], _at(path, last + 1), _at(path, last + 2)
-                )
+                _joint(costs, directions, _at(path, first - 2), _at(path, first - 1), path[last], path[last - 1])
+                + _joint(costs, directions, path[first + 1], path[first], _at(path, last + 1), _at(path, last + 2))
                 - before
             )
             if gain < best:

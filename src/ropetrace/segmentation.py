@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ropetrace.types import CloudFrame, FloatArray, Frame, Intrinsics, RgbdFrame
+from ropetrace.types import CloudFrame, FloatArray, Frame, Intrinsics, RgbdFrame, coordinate_buffer
 
 DARKEST, BRIGHTEST = 0.12, 1.3
 """Light on the rope relative to full light, linear: at its shaded edge, and where it is slightly over-exposed."""
@@ -77,9 +77,7 @@ class ColorGate:
     """What is known of each colour, by r << 16 | g << 8 | b."""
 
     @classmethod
-    def around_color(
-        cls, rgb: tuple[int, int, int], tolerance: float, brightest: float = BRIGHTEST
-    ) -> ColorGate:
+    def around_color(cls, rgb: tuple[int, int, int], tolerance: float, brightest: float = BRIGHTEST) -> ColorGate:
         """Accept what lies within `tolerance` (CIELAB units, delta E 1976) of a colour in any of its own shades.
 
         Shading multiplies linear light, which moves a colour along a curve in CIELAB towards black: the distance is
@@ -168,7 +166,7 @@ class Segmenter:
 
     def _reserve(self, count: int) -> FloatArray:
         if self._points.shape[1] < count:
-            self._points = np.empty((3, count))
+            self._points = coordinate_buffer(count)
         return self._points
 
     def _segment_image(self, frame: RgbdFrame, mask: NDArray[np.bool_] | None) -> FloatArray:
@@ -240,7 +238,10 @@ def _pixel_window(
         return (0, 0), (0, 0)
     near = max(low[2], 1e-6)
     window = []
-    for axis, focal, centre, size in ((1, camera.fy, camera.cy, camera.height), (0, camera.fx, camera.cx, camera.width)):
+    for axis, focal, centre, size in (
+        (1, camera.fy, camera.cy, camera.height),
+        (0, camera.fx, camera.cx, camera.width),
+    ):
         first = low[axis] / (near if low[axis] < 0 else high[2])
         last = high[axis] / (near if high[axis] > 0 else high[2])
         window.append(
@@ -305,7 +306,7 @@ def _key(r: Any, g: Any, b: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _judge(key: int, line: Any, tolerance: float) -> int:
+def _judge(key: Any, line: Any, tolerance: float) -> Any:
     """The verdict on a colour, worked out: about a microsecond, once a colour."""
     inside = _within((key >> 16) & 255, (key >> 8) & 255, key & 255, line, tolerance)
     return _INSIDE if inside else _OUTSIDE
@@ -322,7 +323,7 @@ def _judge_all(colors: Any, line: Any, tolerance: float, verdicts: Any, passed: 
 
 @njit(cache=True, nogil=True)
 def _in_box(x: float, y: float, z: float, box: Any) -> bool:
-    """Whether a point lies in a box of three slabs, each (a, b, c, d, low, high): low <= a x + b y + c z + d <= high."""
+    """Whether a point lies in a box of three slabs (a, b, c, d, low, high): low <= a x + b y + c z + d <= high."""
     inside = True
     for a, b, c, d, low, high in box:
         place = a * x + b * y + c * z + d
@@ -358,7 +359,7 @@ def _scan(
     box: Any,
     flying_gap: float,
     points: Any,
-) -> int:
+) -> Any:
     (top, bottom), (left, right) = window
     fx, fy, cx, cy = lens
     low, high = raw_range
@@ -420,7 +421,7 @@ def _segment_cloud(
     verdicts: Any,
     box: Any,
     points: Any,
-) -> int:
+) -> Any:
     gated, masked = len(colors) > 0, len(flags) > 0
     count = 0
     for index in range(len(cloud)):

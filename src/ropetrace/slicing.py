@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ropetrace.types import FloatArray
+from ropetrace.types import FloatArray, coordinate_buffer
 
 _TIE = 1e-7
 """Points this close to the cutting plane, in standard deviations along the axis, lie on it."""
@@ -36,30 +36,26 @@ class Slices:
         Points of each part.
     capped : bool
         Whether the cap on parts stopped the slicing before the threshold was reached.
-    point_order : (N,) int32 array
-        Indices of the points, part after part: part m has ``point_order[starts[m]:starts[m] + counts[m]]``.
     starts : (M,) int array
-        Where each part begins in `point_order`.
+        Where each part begins in the sorted points: part m is ``points[:, starts[m]:starts[m] + counts[m]]``.
     """
 
     centroids: FloatArray
     covariances: FloatArray
     counts: NDArray[np.int64]
     capped: bool
-    point_order: NDArray[np.int32]
     starts: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.counts)
 
-    def kept(self, keep: NDArray[np.bool_]) -> Slices:
-        """Only the parts where the (M,) mask is true."""
+    def kept(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> Slices:
+        """Only the parts where the (M,) mask is true, or those of the given indices, in their order."""
         return Slices(
             self.centroids[keep],
             self.covariances[keep],
             self.counts[keep],
             self.capped,
-            self.point_order,
             self.starts[keep],
         )
 
@@ -82,8 +78,7 @@ class Slicer:
     variance_threshold: float
     min_points: int | None
     max_nodes: int
-    _work: FloatArray = field(default_factory=lambda: np.empty((6, 0)))
-    _order: NDArray[np.int32] = field(default_factory=lambda: np.empty((2, 0), np.int32))
+    _spare: FloatArray = field(default_factory=lambda: np.empty((3, 0)))
 
     def slice(self, points: FloatArray) -> Slices:
         """Cut a cloud.
@@ -91,16 +86,20 @@ class Slicer:
         Parameters
         ----------
         points : (3, N) float array
-            x, y, z, metres, all finite.
+            x, y, z, metres, all finite. They are sorted in place, part after part.
         """
-        count = points.shape[1]
-        if self._work.shape[1] < count:
-            self._work = np.empty((6, count))
-            self._order = np.empty((2, count), np.int32)
+        if self._spare.shape[1] < points.shape[1]:
+            self._spare = coordinate_buffer(points.shape[1])
         moments = np.empty((self.max_nodes, 10))
         ranges = np.empty((self.max_nodes, 2), np.int64)
+        # Row by row, since a part of a larger buffer is not contiguous as a whole, and the kernels want it to be.
         parts, capped = _slice(
-            points, self.variance_threshold, self.min_points or 1, self._work, self._order, moments, ranges
+            (points[0], points[1], points[2]),
+            (self._spare[0], self._spare[1], self._spare[2]),
+            self.variance_threshold,
+            self.min_points or 1,
+            moments,
+            ranges,
         )
         moments, ranges = moments[:parts], ranges[:parts]
         slices = Slices(
@@ -108,7 +107,6 @@ class Slicer:
             moments[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3),
             ranges[:, 1] - ranges[:, 0],
             bool(capped),
-            self._order[0, :count],
             ranges[:, 0],
         )
         if self.min_points is not None:
@@ -194,22 +192,29 @@ def _distance(a: Any, b: Any) -> float:
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
-def _measure(x: Any, y: Any, z: Any, start: int, stop: int, out: Any) -> None:
-    """Mean, covariance (xx, xy, xz, yy, yz, zz) and its trace."""
+def _measure(points: Any, start: int, stop: int, out: Any) -> None:
+    """Mean, covariance (xx, xy, xz, yy, yz, zz) and its trace.
+
+    Sums are taken about the part's first point, so that no digits are lost to the distance from the camera or to a
+    stray point far away.
+    """
+    x, y, z = points
+    ox, oy, oz = x[start], y[start], z[start]
     sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
     for i in range(np.uintp(start), np.uintp(stop)):
-        sx += x[i]
-        sy += y[i]
-        sz += z[i]
-        sxx += x[i] * x[i]
-        sxy += x[i] * y[i]
-        sxz += x[i] * z[i]
-        syy += y[i] * y[i]
-        syz += y[i] * z[i]
-        szz += z[i] * z[i]
+        dx, dy, dz = x[i] - ox, y[i] - oy, z[i] - oz
+        sx += dx
+        sy += dy
+        sz += dz
+        sxx += dx * dx
+        sxy += dx * dy
+        sxz += dx * dz
+        syy += dy * dy
+        syz += dy * dz
+        szz += dz * dz
     n = stop - start
     mx, my, mz = sx / n, sy / n, sz / n
-    out[0], out[1], out[2] = mx, my, mz
+    out[0], out[1], out[2] = ox + mx, oy + my, oz + mz
     out[3], out[4], out[5] = sxx / n - mx * mx, sxy / n - mx * my, sxz / n - mx * mz
     out[6], out[7], out[8] = syy / n - my * my, syz / n - my * mz, szz / n - mz * mz
     out[9] = max(out[3] + out[6] + out[8], 0.0)
@@ -283,46 +288,46 @@ def _first_axis(m: Any, axis: Any) -> float:
 def _ties(x: Any, y: Any, z: Any, start: int, stop: int, mean: Any, axis: Any, tie: float) -> Any:
     """How many points lie on the cutting plane, and the sums of cubes and absolute cubes of their distances."""
     ax, ay, az = axis[0], axis[1], axis[2]
-    shift = mean[0] * ax + mean[1] * ay + mean[2] * az
+    mx, my, mz = mean[0], mean[1], mean[2]
     ties = 0
     for i in range(np.uintp(start), np.uintp(stop)):
-        ties += abs(x[i] * ax + y[i] * ay + z[i] * az - shift) <= tie
+        ties += abs((x[i] - mx) * ax + (y[i] - my) * ay + (z[i] - mz) * az) <= tie
     cubes = absolute = 0.0
     if ties:
         for i in range(start, stop):
-            place = x[i] * ax + y[i] * ay + z[i] * az - shift
+            place = (x[i] - mx) * ax + (y[i] - my) * ay + (z[i] - mz) * az
             cubes += place**3
             absolute += abs(place**3)
     return ties, cubes, absolute
 
 
 @njit(cache=True, nogil=True)
-def _cut(work: Any, order: Any, start: int, stop: int, mean: Any, axis: Any, variance: float) -> int:
+def _cut(points: Any, spare: Any, start: int, stop: int, mean: Any, axis: Any, variance: float) -> int:
     """Move the points before the cutting plane behind those on or beyond it; returns where they begin.
 
     Points on the plane (equations 6 and 7 put them on the side the axis points to, and its sign is arbitrary) go to
     the side of the longer tail; where the part is symmetric, to the side of the axis' first large coordinate. Neither
     depends on rounding, so gridded clouds are cut alike wherever they lie.
     """
-    x, y, z, order_x = work[0], work[1], work[2], order[0]
-    spare_x, spare_y, spare_z, spare_order = work[3], work[4], work[5], order[1]
+    x, y, z = points
+    spare_x, spare_y, spare_z = spare
     tie = _TIE * np.sqrt(variance)
     ties, cubes, absolute = _ties(x, y, z, start, stop, mean, axis, tie)
     sign = -1.0 if ties and cubes < -_EQUAL * absolute else 1.0
     ax, ay, az = sign * axis[0], sign * axis[1], sign * axis[2]
-    least = mean[0] * ax + mean[1] * ay + mean[2] * az - tie
+    mx, my, mz = mean[0], mean[1], mean[2]
     left = np.uintp(start)
     right = np.uintp(0)
     for i in range(np.uintp(start), np.uintp(stop)):
         # Written to both sides and counted on one: no branch for the processor to guess wrong.
-        xi, yi, zi, oi = x[i], y[i], z[i], order_x[i]
-        beyond = np.uintp(xi * ax + yi * ay + zi * az >= least)
-        x[left], y[left], z[left], order_x[left] = xi, yi, zi, oi
-        spare_x[right], spare_y[right], spare_z[right], spare_order[right] = xi, yi, zi, oi
+        xi, yi, zi = x[i], y[i], z[i]
+        beyond = np.uintp((xi - mx) * ax + (yi - my) * ay + (zi - mz) * az >= -tie)
+        x[left], y[left], z[left] = xi, yi, zi
+        spare_x[right], spare_y[right], spare_z[right] = xi, yi, zi
         left += beyond
         right += np.uintp(1) - beyond
     for i in range(right):
-        x[left + i], y[left + i], z[left + i], order_x[left + i] = spare_x[i], spare_y[i], spare_z[i], spare_order[i]
+        x[left + i], y[left + i], z[left + i] = spare_x[i], spare_y[i], spare_z[i]
     return int(left)
 
 
@@ -355,25 +360,16 @@ def _sift_down(heap: Any, size: int, moments: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _slice(
-    points: Any, threshold: float, min_points: int, work: Any, order: Any, moments: Any, ranges: Any
-) -> Any:
+def _slice(points: Any, spare: Any, threshold: float, min_points: int, moments: Any, ranges: Any) -> Any:
     """Fill `moments` and `ranges` with the parts; returns how many, and whether the cap on parts was met."""
-    count = points.shape[1]
+    count = len(points[0])
     max_parts = len(ranges)
     if count < min_points or count == 0:
         return 0, False
-    # Moments about a point of the cloud lose no digits to its distance from the camera.
-    origin = (points[0, 0], points[1, 0], points[2, 0])
-    for i in range(count):
-        work[0, i] = points[0, i] - origin[0]
-        work[1, i] = points[1, i] - origin[1]
-        work[2, i] = points[2, i] - origin[2]
-        order[0, i] = i
     heap = np.empty(max_parts, np.int64)
     axis = np.empty(3)
     ranges[0, 0], ranges[0, 1] = 0, count
-    _measure(work[0], work[1], work[2], 0, count, moments[0])
+    _measure(points, 0, count, moments[0])
     heap[0] = 0
     heap_size = parts = 1
     threshold *= 1 + 1e-9
@@ -384,7 +380,7 @@ def _slice(
             break
         start, stop = ranges[part]
         variance = _first_axis(moments[part], axis)
-        middle = _cut(work, order, start, stop, moments[part], axis, variance)
+        middle = _cut(points, spare, start, stop, moments[part], axis, variance)
         if middle == start or middle == stop:
             # Points that coincide, or nearly: no plane separates them.
             heap_size -= 1
@@ -397,12 +393,12 @@ def _slice(
             break
         if keep_left:
             ranges[part, 1] = middle
-            _measure(work[0], work[1], work[2], start, middle, moments[part])
+            _measure(points, start, middle, moments[part])
             _sift_down(heap, heap_size, moments)
         if keep_right:
             new = parts if keep_left else part
             ranges[new, 0], ranges[new, 1] = middle, stop
-            _measure(work[0], work[1], work[2], middle, stop, moments[new])
+            _measure(points, middle, stop, moments[new])
             if keep_left:
                 heap[heap_size] = new
                 heap_size += 1
@@ -415,7 +411,4 @@ def _slice(
             heap[0] = heap[heap_size]
             _sift_down(heap, heap_size, moments)
             ranges[part, 1] = start
-    for part in range(parts):
-        for k in range(3):
-            moments[part, k] += origin[k]
     return parts, capped

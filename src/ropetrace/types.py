@@ -139,9 +139,7 @@ class CloudFrame:
             raise FrameError(
                 f"points are {self.points.dtype} of shape {self.points.shape}: expected (N, 3) floating point"
             )
-        if self.colors is not None and (
-            self.colors.shape != self.points.shape or self.colors.dtype != np.uint8
-        ):
+        if self.colors is not None and (self.colors.shape != self.points.shape or self.colors.dtype != np.uint8):
             raise FrameError(
                 f"point colours are {self.colors.dtype} of shape {self.colors.shape}: "
                 f"expected uint8 of shape {self.points.shape}"
@@ -158,6 +156,11 @@ class BadFrame:
 
 Frame = RgbdFrame | CloudFrame
 """What a tracker takes."""
+
+
+def lacks_color(frame: Frame) -> bool:
+    """Whether there is nothing for a colour gate to look at."""
+    return (frame.colors if isinstance(frame, CloudFrame) else frame.color) is None
 
 
 class Status(StrEnum):
@@ -260,3 +263,32 @@ class Estimate:
     def lost(cls, stamp_ns: int, reason: str, point_count: int = 0) -> Estimate:
         """Nothing to report, and why."""
         return cls(stamp_ns, Status.LOST, (reason,), point_count=point_count)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """The points behind an estimate.
+
+    Parameters
+    ----------
+    points : (N, 3) float array
+        Metres.
+    node : (N,) int32 array
+        Index of each point's node in `Estimate.nodes`; -1 for none.
+    """
+
+    points: FloatArray
+    node: NDArray[np.int32]
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or self.node.shape != self.points.shape[:1]:
+            raise ValueError(f"cloud: shapes {self.points.shape}, {self.node.shape} do not fit")
+
+
+def coordinate_buffer(count: int) -> FloatArray:
+    """Room for `count` points as three rows: (3, `count` or a little more), not initialised.
+
+    Rows that lie a whole number of memory pages apart would compete for the same places of the processor's cache, and
+    image sizes make just such numbers: the rows are kept off that grid.
+    """
+    return np.empty((3, -(-count // 512) * 512 + 136))

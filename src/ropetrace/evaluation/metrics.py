@@ -30,7 +30,7 @@ def resample(curve: FloatArray, spacing: float) -> FloatArray:
         First and last vertex included.
     """
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-    places = np.linspace(0, length[-1], max(int(round(length[-1] / spacing)), 1) + 1)
+    places = np.linspace(0, length[-1], max(round(length[-1] / spacing), 1) + 1)
     return np.stack([np.interp(places, length, curve[:, axis]) for axis in range(3)], axis=1)
 
 

@@ -39,7 +39,9 @@ def kinect_axial(
     window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     z = depth[window].astype(float)
     around = np.pad(z, 1)
-    steps = [np.abs(other - z) > 0.05 for other in (around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:])]
+    steps = [
+        np.abs(other - z) > 0.05 for other in (around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:])
+    ]
     edge = np.logical_or.reduce(steps)
     seen = (z > 0) & ~(edge & (rng.random(z.shape) < lost_edges))
     z += rng.standard_normal(z.shape) * (0.0012 + 0.0019 * (z - 0.4) ** 2)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from ropetrace.config import RopeConfig
 from ropetrace.errors import ConfigError
-from ropetrace.trackers.base import Cloud, Mask, Tracker
+from ropetrace.trackers.base import Mask, Tracker
 from ropetrace.trackers.slicing import SlicingTracker
 
 METHODS = {"slicing": SlicingTracker}
 
-__all__ = ["METHODS", "Cloud", "Mask", "SlicingTracker", "Tracker", "make_tracker"]
+__all__ = ["METHODS", "Mask", "SlicingTracker", "Tracker", "make_tracker"]
 
 
 def make_tracker(config: RopeConfig, mask: Mask | None = None) -> Tracker:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ropetrace.types import Estimate, FloatArray, Frame
+from ropetrace.types import Cloud, Estimate, Frame
 
 Mask = NDArray[np.bool_] | Callable[[Frame], NDArray[np.bool_]]
 """True where the rope is: (H, W) for an image, (N,) for a cloud; or a function that makes one of a frame."""
@@ -20,22 +19,6 @@ Lap = Callable[[str], None]
 
 def no_lap(stage: str) -> None:
     """Times nothing."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Cloud:
-    """The points behind an estimate.
-
-    Parameters
-    ----------
-    points : (N, 3) float array
-        Metres, camera frame.
-    node : (N,) int32 array
-        Index of each point's node in `Estimate.nodes`; -1 for none.
-    """
-
-    points: FloatArray
-    node: NDArray[np.int32]
 
 
 class Tracker(Protocol):

@@ -13,8 +13,8 @@ from ropetrace.errors import FrameError
 from ropetrace.ordering import NodeGraph, end_scores, order_greedy, order_path, runs_backwards
 from ropetrace.segmentation import ColorGate, PositionBox, Segmenter
 from ropetrace.slicing import Slicer, Slices, axis_points
-from ropetrace.trackers.base import Cloud, Lap, Mask, no_lap
-from ropetrace.types import CloudFrame, Estimate, FloatArray, Frame, RgbdFrame, Status, Waypoints
+from ropetrace.trackers.base import Lap, Mask, no_lap
+from ropetrace.types import Cloud, CloudFrame, Estimate, FloatArray, Frame, RgbdFrame, Status, Waypoints
 
 
 class SlicingTracker:
@@ -60,7 +60,7 @@ class SlicingTracker:
         reasons = self._stamp_trouble(frame.stamp_ns)
         self._slices = None
 
-        points, count, stride = self._rope_points(frame)
+        points, count, stride = self.rope_points(frame)
         lap("segmentation")
         if count == 0:
             return Estimate.lost(frame.stamp_ns, "no points of the rope's colour and place")
@@ -100,7 +100,7 @@ class SlicingTracker:
         node = np.full(self._points.shape[1], -1, np.int32)
         if self._slices is not None:
             for index, (start, count) in enumerate(zip(self._slices.starts, self._slices.counts, strict=True)):
-                node[self._slices.point_order[start : start + count]] = index
+                node[start : start + count] = index
         return Cloud(self._points.T.copy(), node)
 
     def _stamp_trouble(self, stamp_ns: int) -> list[str]:
@@ -111,8 +111,24 @@ class SlicingTracker:
             return ["the stamp repeats that of the frame before"]
         return [f"the stamp runs back by {(previous - stamp_ns) / 1e9:.3f} s"]
 
-    def _rope_points(self, frame: Frame) -> tuple[FloatArray, int, int]:
-        """The points to use, (3, N); how many there were; and the stride that took these from them."""
+    def seen_diameter(self) -> float:
+        """The diameter of a tube as wide as the last frame's slices look, metres; 0 if it had none.
+
+        The camera sees points spread evenly over a tube's width, whose variance is a twelfth of its square.
+        """
+        if self._slices is None:
+            return 0.0
+        widths = []
+        for centroid, covariance, tangent in zip(
+            self._slices.centroids, self._slices.covariances, chain_tangents(self._slices.centroids), strict=True
+        ):
+            side = np.cross(tangent, centroid)
+            side /= max(float(np.linalg.norm(side)), 1e-12)
+            widths.append(np.sqrt(12 * max(float(side @ covariance @ side), 0.0)))
+        return float(np.median(widths))
+
+    def rope_points(self, frame: Frame) -> tuple[FloatArray, int, int]:
+        """The points to use, (3, N); how many passed the gates; and the stride that took these from them."""
         mask = self._mask(frame) if callable(self._mask) else self._mask
         shape = frame.depth.shape if isinstance(frame, RgbdFrame) else (len(frame.points),)
         if mask is not None and (mask.shape != shape or mask.dtype != np.bool_):
@@ -150,9 +166,7 @@ class SlicingTracker:
         ordering = self.config.ordering
         graph = NodeGraph.of(slices.centroids, slices.covariances)
         if ordering.method == "greedy":
-            order = order_greedy(
-                slices.centroids, int(np.argmax(end_scores(slices.centroids, ordering.first_point)))
-            )
+            order = order_greedy(slices.centroids, int(np.argmax(end_scores(slices.centroids, ordering.first_point))))
         else:
             order = order_path(graph)
         gaps = graph.gaps[order[:-1], order[1:]]
@@ -200,7 +214,9 @@ def _reach(slices: Slices, tangents: FloatArray) -> tuple[float, float]:
 
 def _too_little(points: int, slices: int) -> str:
     if slices == 1 and points >= 20:
-        return f"{points} points make a single slice: the diameter (or slicing.variance_threshold) is too large for them"
+        return (
+            f"{points} points make a single slice: the diameter (or slicing.variance_threshold) is too large for them"
+        )
     return f"too few points ({points})"
 
 

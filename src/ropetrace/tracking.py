@@ -1,0 +1,189 @@
+"""A tracker run over a recording: where clocks, writers and pictures meet the pure core."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from ropetrace.errors import FrameError
+from ropetrace.trackers.base import Tracker
+from ropetrace.types import BadFrame, Cloud, Estimate, FloatArray, Frame, Status
+
+Event = Frame | BadFrame
+
+
+class Sink(Protocol):
+    """What takes the estimates of a run: a writer of results, the live viewer, a picture."""
+
+    def write(self, index: int, estimate: Estimate, frame: Frame | None, cloud: Cloud | None) -> None:
+        """Take the estimate of one frame."""
+
+
+@dataclass(slots=True)
+class Summary:
+    """What a run came to; prints itself."""
+
+    frames: int = 0
+    statuses: Counter[Status] = field(default_factory=Counter)
+    reasons: Counter[str] = field(default_factory=Counter)
+    points: list[int] = field(default_factory=list)
+    nodes: list[int] = field(default_factory=list)
+    lengths: list[float] = field(default_factory=list)
+    stage_seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    interrupted: bool = False
+
+    def add(self, estimate: Estimate) -> None:
+        """Count one frame."""
+        self.frames += 1
+        self.statuses[estimate.status] += 1
+        self.reasons.update(_kind(reason) for reason in estimate.reasons)
+        if estimate.status is not Status.LOST:
+            self.points.append(estimate.point_count)
+            self.nodes.append(len(estimate.nodes))
+            self.lengths.append(estimate.waypoints.length)
+
+    @property
+    def found(self) -> int:
+        """Frames with an estimate."""
+        return len(self.nodes)
+
+    def lines(self) -> list[str]:
+        """The summary for people."""
+        counts = ", ".join(f"{self.statuses[status]} {status}" for status in Status)
+        lines = [f"frames    {self.frames} ({counts})"]
+        for reason, count in self.reasons.most_common(5):
+            lines.append(f"          {count} x {reason}")
+        if self.found:
+            lines += [
+                f"points    {np.median(self.points):.0f} a frame (median)",
+                f"nodes     {np.median(self.nodes):.0f} a frame (median)",
+                f"length    {np.median(self.lengths):.3f} m (median), "
+                f"{min(self.lengths):.3f} to {max(self.lengths):.3f} m",
+            ]
+        if self.stage_seconds:
+            lines.append("time      stage            p50 ms   p99 ms")
+            first = 0.0
+            for stage, seconds in self.stage_seconds.items():
+                # The first frame waits for the compiler, or for its cache: it is not like the others.
+                rest = seconds[1:] or seconds
+                first += seconds[0]
+                p50, p99 = np.percentile(np.array(rest) * 1e3, [50, 99])
+                lines.append(f"          {stage:14s} {p50:8.3f} {p99:8.3f}")
+            lines.append(f"          without the first frame, which took {first:.2f} s with the start of the kernels")
+        return lines
+
+
+def _kind(reason: str) -> str:
+    """A reason without its figures, so that like reasons are counted together."""
+    return " ".join("#" if any(c.isdigit() for c in word) and len(word) < 12 else word for word in reason.split())
+
+
+def track_recording(
+    frames: Iterable[Event],
+    tracker: Tracker,
+    sinks: Iterable[Sink] = (),
+    *,
+    first_index: int = 0,
+    world_from_camera: FloatArray | None = None,
+    wants_cloud: bool = False,
+    on_frame: Callable[[Estimate], None] | None = None,
+) -> Summary:
+    """Track every frame and hand the estimates on.
+
+    Parameters
+    ----------
+    frames : iterable
+        Such as `Recording.frames`.
+    tracker : Tracker
+        Takes them.
+    sinks : iterable of Sink
+        Each is given every estimate.
+    first_index : int
+        Index of the first frame in its recording.
+    world_from_camera : (4, 4) float array, optional
+        Hand the estimates on in the world's frame.
+    wants_cloud : bool
+        Whether the sinks are given the points and their nodes.
+    on_frame : callable, optional
+        Told of each estimate, for a progress bar.
+
+    Returns
+    -------
+    Summary
+        With the times of every stage. An interruption by the user ends the run and is told there.
+
+    Raises
+    ------
+    OutputError
+        If a sink cannot write.
+    """
+    sinks = list(sinks)
+    summary = Summary()
+    iterator = iter(frames)
+    index = first_index
+    try:
+        while True:
+            watch = _Stopwatch(summary.stage_seconds)
+            event = next(iterator, None)
+            if event is None:
+                break
+            watch.lap("read")
+            estimate = _estimate(event, tracker, watch)
+            if world_from_camera is not None:
+                estimate = in_world(estimate, world_from_camera)
+            cloud = tracker.cloud() if wants_cloud and not isinstance(event, BadFrame) else None
+            if cloud is not None and world_from_camera is not None:
+                cloud = Cloud(_moved(cloud.points, world_from_camera), cloud.node)
+            watch.lap("")
+            for sink in sinks:
+                sink.write(index, estimate, None if isinstance(event, BadFrame) else event, cloud)
+            if sinks:
+                watch.lap("write")
+            summary.add(estimate)
+            if on_frame is not None:
+                on_frame(estimate)
+            index += 1
+    except KeyboardInterrupt:
+        summary.interrupted = True
+    return summary
+
+
+def in_world(estimate: Estimate, world_from_camera: FloatArray) -> Estimate:
+    """The estimate with its positions and orientations in the world's frame."""
+    return replace(
+        estimate,
+        nodes=_moved(estimate.nodes, world_from_camera),
+        waypoints=estimate.waypoints.transformed(world_from_camera),
+    )
+
+
+def _moved(points: FloatArray, transform: FloatArray) -> FloatArray:
+    return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def _estimate(event: Event, tracker: Tracker, watch: _Stopwatch) -> Estimate:
+    if isinstance(event, BadFrame):
+        return Estimate.lost(event.stamp_ns, event.reason)
+    try:
+        return tracker.update(event, watch.lap)
+    except FrameError as error:
+        return Estimate.lost(event.stamp_ns, str(error))
+
+
+class _Stopwatch:
+    """Adds the time since the last lap to a stage's list; a stage without a name is not kept."""
+
+    def __init__(self, stages: dict[str, list[float]]) -> None:
+        self._stages = stages
+        self._since = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        if stage:
+            self._stages[stage].append(now - self._since)
+        self._since = now
