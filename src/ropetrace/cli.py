@@ -1,0 +1,425 @@
+"""The command line: words for people, no logic."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from ropetrace.errors import ConfigError, OutputError, RopetraceError
+
+if TYPE_CHECKING:
+    from ropetrace.config import RopeConfig
+    from ropetrace.recordings import Recording
+
+BAD_INPUT, NOTHING_FOUND, DAMAGED, INTERRUPTED = 2, 1, 3, 130
+"""Exit codes: what was given is wrong; no frame gave an estimate; part of the recording was lost; Ctrl-C."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Which recording, and which part of it."""
+
+    recording: Positional[Path]
+    """An RGB-D folder, a ROS 2 bag (.mcap, .db3, or their folder), a ROS 1 .bag, or point clouds (a folder of .npy,
+    .npz, .ply, .pcd, or one of them)."""
+    rate: float | None = None
+    """Frames per second, for recordings without stamps."""
+    start: int = 0
+    """Frames to skip."""
+    limit: int | None = None
+    """Frames to use at most."""
+    depth_topic: str | None = None
+    """ROS: the depth images. Found by type if not given."""
+    color_topic: str | None = None
+    """ROS: the colour images. Found by type if not given."""
+    cloud_topic: str | None = None
+    """ROS: point clouds, in the place of depth images."""
+
+    def open(self) -> Recording:
+        """Open the recording."""
+        from ropetrace.recordings import open_recording
+
+        if self.start < 0:
+            raise ConfigError(f"--start {self.start}: expected 0 or more")
+        if self.limit is not None and self.limit < 1:
+            raise ConfigError(f"--limit {self.limit}: expected 1 or more")
+        return open_recording(
+            self.recording,
+            rate=self.rate,
+            depth_topic=self.depth_topic,
+            color_topic=self.color_topic,
+            cloud_topic=self.cloud_topic,
+        )
+
+
+@dataclass(frozen=True)
+class Rope:
+    """What is known of the rope."""
+
+    diameter: Annotated[str | None, arg(aliases=["-d"], metavar="LENGTH")] = None
+    """The rope's diameter, such as 12mm. Needed here or in the config."""
+    color: Annotated[str | None, arg(aliases=["-c"], metavar="'#RRGGBB'")] = None
+    """The rope's colour in full light, such as '#c8281e'. Without it, everything with depth is rope."""
+    config: Path | None = None
+    """A TOML file with further settings; those given here count first."""
+    method: str | None = None
+    """The tracker: slicing (the default)."""
+
+    def settings(self) -> RopeConfig:
+        """The settings of the file and the command line together."""
+        from ropetrace.config import RopeConfig, parse_length
+
+        given: dict[str, Any] = {
+            "diameter": None if self.diameter is None else parse_length(self.diameter),
+            "color": self.color,
+            "method": self.method,
+        }
+        if self.config is not None:
+            return RopeConfig.from_toml(self.config, **given)
+        if self.diameter is None:
+            raise ConfigError("the rope's diameter is missing: give --diameter, such as --diameter 12mm")
+        return RopeConfig(**{name: value for name, value in given.items() if value is not None})
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Make a short RGB-D recording, track it, and say where the results are."""
+
+    out: Annotated[Path, arg(aliases=["-o"])] = Path("ropetrace-demo")
+    """The folder for the recording and the results."""
+
+    def run(self) -> int:
+        from ropetrace import demo
+        from ropetrace.config import RopeConfig
+        from ropetrace.recordings import open_recording
+
+        recording_folder = self.out / "recording"
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{self.out}: cannot be made: {error.strerror}") from None
+        if not recording_folder.exists():
+            print(f"making a recording of {demo.FRAMES} frames ...")
+            demo.make_recording(recording_folder)
+        config = RopeConfig(demo.DIAMETER, "#{:02x}{:02x}{:02x}".format(*demo.COLOR))
+        result, picture = self.out / "result.csv", self.out / "result.png"
+        print("tracking it (the first run on a machine compiles for some seconds) ...")
+        truth = _TruthOfDemo()
+        code = _track(
+            open_recording(recording_folder), config, [result], picture=picture, overwrite=True, extra_sinks=[truth]
+        )
+        print(f"error     {truth.mean() * 1e3:.2f} mm mean distance to the true centreline (symmetric)")
+        print(f"recording {recording_folder}\nresult    {result}\npicture   {picture}")
+        print(
+            "the same by hand:\n"
+            f"  ropetrace track {recording_folder} --diameter 12mm --color '{config.color}' --out my-result.csv"
+        )
+        return code
+
+
+@dataclass(frozen=True)
+class Track:
+    """Track the rope through a recording.
+
+    ropetrace track RECORDING --diameter 12mm --color '#c8281e' --out result.csv
+    """
+
+    source: OmitArgPrefixes[Source]
+    rope: OmitArgPrefixes[Rope]
+    out: Annotated[tuple[Path, ...], arg(aliases=["-o"], metavar="FILE ...")] = ()
+    """Results: .csv, .parquet, .npz, .mcap or .rrd; several may be given."""
+    picture: Path | None = None
+    """A picture of six frames spread over the run, with the centreline drawn over them."""
+    mask: Path | None = None
+    """An image of the frames' size, white where the rope may be; replaces the colour."""
+    frame: Literal["camera", "world"] = "camera"
+    """The frame of the results; world needs camera_pose in the config."""
+    view: bool = False
+    """Show it live in the Rerun viewer."""
+    overwrite: bool = False
+    """Replace results that exist."""
+
+    def run(self) -> int:
+        config = self.rope.settings()
+        recording = self.source.open()
+        return _track(
+            recording,
+            config,
+            list(self.out),
+            picture=self.picture,
+            start=self.source.start,
+            limit=self.source.limit,
+            mask=self.mask,
+            frame=self.frame,
+            view=self.view,
+            overwrite=self.overwrite,
+        )
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what is in a recording: streams, sizes, rates, gaps, intrinsics, damage."""
+
+    source: OmitArgPrefixes[Source]
+
+    def run(self) -> int:
+        info = self.source.open().info()
+        print(f"{info.path}: {info.kind}")
+        header = ("stream", "encoding", "count", "size", "rate", "longest gap", "not rising")
+        rows = [
+            (
+                stream.name,
+                stream.encoding,
+                str(stream.count),
+                "" if stream.width is None else f"{stream.width}x{stream.height}",
+                "" if stream.rate_hz is None else f"{stream.rate_hz:.2f} Hz",
+                "" if stream.largest_gap is None else f"{stream.largest_gap * 1e3:.1f} ms",
+                str(stream.not_rising),
+            )
+            for stream in info.streams
+        ]
+        widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
+        for row in [header, *rows]:
+            print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        if info.duration is not None:
+            print(f"duration   {info.duration:.3f} s")
+        if info.intrinsics is not None:
+            camera = info.intrinsics
+            print(
+                f"intrinsics {camera.width}x{camera.height}, fx {camera.fx:.3f}, fy {camera.fy:.3f}, "
+                f"cx {camera.cx:.3f}, cy {camera.cy:.3f}"
+            )
+        print(f"checksums  {info.checksums}")
+        for problem in info.problems:
+            print(f"damage     {problem}")
+        return DAMAGED if info.problems else 0
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Find out why tracking fails on a recording, and which setting would help."""
+
+    source: OmitArgPrefixes[Source]
+    rope: OmitArgPrefixes[Rope]
+    picture: Path = Path("ropetrace-doctor.png")
+    """Where to put the picture of what the gate keeps."""
+    frames: int = 20
+    """How many frames to look at, spread over the recording."""
+
+    def run(self) -> int:
+        from ropetrace.doctor import diagnose
+        from ropetrace.picture import save_picture
+
+        config = self.rope.settings()
+        recording = self.source.open()
+        diagnosis = diagnose(_spread(recording, self.source, self.frames), config, recording.info())
+        print("\n".join(diagnosis.lines()))
+        if diagnosis.picture is not None:
+            save_picture(diagnosis.picture, self.picture)
+            print(f"picture of what passes: {self.picture}")
+        return 0 if diagnosis.healthy else NOTHING_FOUND
+
+
+def main() -> None:
+    """The entry point: parse, run, and turn errors into one line and an exit code."""
+    if sys.argv[1:] == ["--version"]:
+        print(version("ropetrace"))
+        return
+    command = tyro.cli(
+        Annotated[Demo, tyro.conf.subcommand("demo")]
+        | Annotated[Track, tyro.conf.subcommand("track")]
+        | Annotated[Info, tyro.conf.subcommand("info")]
+        | Annotated[Doctor, tyro.conf.subcommand("doctor")],  # type: ignore[arg-type]
+        prog="ropetrace",
+        description="The 3-D shape of a rope, cable or hose from the recordings of an RGB-D camera.",
+    )
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        code = command.run()
+    except RopetraceError as error:
+        print(f"ropetrace: {error}", file=sys.stderr)
+        code = BAD_INPUT
+    except KeyboardInterrupt:
+        print("ropetrace: interrupted", file=sys.stderr)
+        code = INTERRUPTED
+    except BrokenPipeError:
+        # Whoever reads our output has gone, as `ropetrace info | head` does.
+        sys.stderr.close()
+        code = 0
+    sys.exit(code)
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _track(
+    recording: Recording,
+    config: RopeConfig,
+    outputs: list[Path],
+    *,
+    picture: Path | None = None,
+    start: int = 0,
+    limit: int | None = None,
+    mask: Path | None = None,
+    frame: str = "camera",
+    view: bool = False,
+    overwrite: bool = False,
+    extra_sinks: list[Any] | None = None,
+) -> int:
+    from ropetrace.picture import ContactSheet
+    from ropetrace.results import open_writer
+    from ropetrace.trackers import make_tracker
+    from ropetrace.tracking import track_recording
+
+    if frame == "world" and config.camera_pose is None:
+        raise ConfigError("--frame world needs camera_pose in the config")
+    if picture is not None and frame == "world":
+        raise ConfigError("--picture draws in the camera's frame: leave out --frame world")
+    if picture is not None and picture.exists() and not overwrite:
+        raise OutputError(f"{picture} exists already: choose another name or give --overwrite")
+    if config.asks_for_color and mask is None and not _has_color(recording, start):
+        raise ConfigError("a colour is asked for, but the recording has none: leave out the colour, or record it")
+    tracker = make_tracker(config, None if mask is None else _mask(mask))
+    resolved = config.resolved().to_toml()
+    pose = config.world_from_camera() if frame == "world" else None
+    contact = None if picture is None else ContactSheet(picture)
+    with ExitStack() as stack:
+        sinks: list[Any] = [
+            stack.enter_context(
+                open_writer(
+                    path, overwrite=overwrite, frame_name=frame, metadata={"config": resolved}, frame_from_camera=pose
+                )
+            )
+            for path in outputs
+        ]
+        for path in outputs:
+            _write_config(path.with_name(path.name + ".toml"), resolved)
+        viewer = None
+        if view:
+            from ropetrace.results.live import LiveViewer
+
+            viewer = stack.enter_context(LiveViewer(frame_name=frame, frame_from_camera=pose))
+            sinks.append(viewer)
+        if contact is not None:
+            sinks.append(contact)
+        sinks += extra_sinks or []
+        total = None if recording.frame_count is None else max(recording.frame_count - start, 0)
+        if limit is not None:
+            total = limit if total is None else min(total, limit)
+        with _progress(total) as advance:
+            summary = track_recording(
+                recording.frames(start, limit),
+                tracker,
+                sinks,
+                first_index=start,
+                world_from_camera=pose,
+                wants_cloud=view or any(path.suffix.lower() == ".rrd" for path in outputs),
+                on_frame=lambda estimate: advance(str(estimate.status)),
+            )
+    if contact is not None:
+        contact.save()
+    print("\n".join(summary.lines()))
+    for problem in recording.problems:
+        print(f"damage    {problem}")
+    for path in outputs:
+        print(f"written   {path} (settings: {path.name}.toml)")
+    if viewer is not None and viewer.skipped:
+        print(f"viewer    skipped {viewer.skipped} frames to keep up")
+    if summary.interrupted:
+        print("ropetrace: interrupted; what was tracked until then is written", file=sys.stderr)
+        return INTERRUPTED
+    if recording.problems:
+        print("ropetrace: part of the recording was lost (see damage above)", file=sys.stderr)
+        return DAMAGED
+    if not summary.found:
+        print(
+            "ropetrace: no frame gave an estimate; `ropetrace doctor` with the same arguments says why",
+            file=sys.stderr,
+        )
+        return NOTHING_FOUND
+    return 0
+
+
+@contextmanager
+def _progress(total: int | None) -> Iterator[Any]:
+    """A bar with frames per second on a terminal; nothing when piped."""
+    from tqdm import tqdm
+
+    with tqdm(total=total, unit="frame", disable=not sys.stderr.isatty(), leave=False) as bar:
+
+        def advance(status: str) -> None:
+            bar.set_postfix_str(status, refresh=False)
+            bar.update()
+
+        yield advance
+
+
+def _has_color(recording: Recording, start: int) -> bool:
+    """Whether the first sound frame has colour; true if there is no sound frame, which shows later."""
+    from ropetrace.types import BadFrame, lacks_color
+
+    for event in recording.frames(start, 50):
+        if not isinstance(event, BadFrame):
+            return not lacks_color(event)
+    return True
+
+
+def _write_config(path: Path, text: str) -> None:
+    try:
+        path.write_text(f"# ropetrace {version('ropetrace')}, {time.strftime('%Y-%m-%d')}\n{text}", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _mask(path: Path) -> Any:
+    import numpy as np
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("L")) > 127
+    except OSError as error:
+        raise ConfigError(f"--mask {path}: cannot be read as an image: {error}") from None
+
+
+def _spread(recording: Recording, source: Source, count: int) -> Iterator[Any]:
+    """About `count` frames over the recording, or over the part of it that is asked for."""
+    available = source.limit or (None if recording.frame_count is None else recording.frame_count - source.start)
+    every = 1 if available is None else max(available // count, 1)
+    for index, event in enumerate(recording.frames(source.start, source.limit or count * every)):
+        if index % every == 0:
+            yield source.start + index, event
+
+
+class _TruthOfDemo:
+    """A sink that compares the demo's estimates with the curves that it was made of."""
+
+    def __init__(self) -> None:
+        self._errors: list[float] = []
+
+    def write(self, index: int, estimate: Any, frame: Any, cloud: Any) -> None:
+        from ropetrace import demo
+        from ropetrace.evaluation.metrics import symmetric_mean
+
+        if len(estimate.waypoints) > 1:
+            truth = demo.rope_curve(estimate.stamp_ns / 1e9)
+            self._errors.append(symmetric_mean(estimate.waypoints.positions, truth))
+
+    def mean(self) -> float:
+        """Metres."""
+        return sum(self._errors) / max(len(self._errors), 1)
+
+
+if __name__ == "__main__":
+    main()
