@@ -1,0 +1,70 @@
+"""Writers of results, one file a format. `open_writer` chooses by the ending of the path."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import cast
+
+from ropetrace.errors import OutputError
+from ropetrace.results.base import ResultWriter
+from ropetrace.types import FloatArray
+
+__all__ = ["FORMATS", "ResultWriter", "open_writer"]
+
+FORMATS = MappingProxyType(
+    {
+        ".csv": ("ropetrace.results.text", "CsvWriter"),
+        ".parquet": ("ropetrace.results.parquet", "ParquetWriter"),
+        ".npz": ("ropetrace.results.arrays", "NpzWriter"),
+        ".mcap": ("ropetrace.results.ros", "McapWriter"),
+        ".rrd": ("ropetrace.results.rrd", "RrdWriter"),
+    }
+)
+"""The endings that `open_writer` takes, each with the class that writes it."""
+
+NO_METADATA: Mapping[str, str] = MappingProxyType({})
+
+
+def open_writer(
+    path: str | Path,
+    *,
+    overwrite: bool = False,
+    frame_name: str = "camera",
+    metadata: Mapping[str, str] = NO_METADATA,
+    frame_from_camera: FloatArray | None = None,
+) -> ResultWriter:
+    """Create a file for results.
+
+    Parameters
+    ----------
+    path : path
+        Its ending chooses the format: one of `FORMATS`.
+    overwrite : bool
+        Whether a file that is there already may be replaced.
+    frame_name : str
+        The frame of the positions that will be written: ``camera`` is the camera's optical frame.
+    metadata : mapping of str to str
+        Kept in the file beside the results (CSV has no room for it), such as the resolved configuration.
+    frame_from_camera : (4, 4) float array, optional
+        The camera's pose in the frame `frame_name`, if that is not ``camera``: where `.rrd` shows the images.
+
+    Raises
+    ------
+    OutputError
+        If the ending is unknown, the file exists and `overwrite` is not set, or it cannot be made.
+    MissingExtraError
+        If the format needs an extra that is not installed.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise OutputError(f"{path}: cannot tell the format from the ending {path.suffix!r}: use {', '.join(FORMATS)}")
+    module, name = FORMATS[path.suffix.lower()]
+    writer = getattr(importlib.import_module(module), name)
+    extra = {"frame_from_camera": frame_from_camera} if path.suffix.lower() == ".rrd" else {}
+    return cast(
+        ResultWriter,
+        writer(path, overwrite=overwrite, frame_name=frame_name, metadata=metadata, **extra),
+    )

@@ -1,0 +1,87 @@
+"""Results as NPZ: plain NumPy arrays."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ropetrace.results.base import Closing
+from ropetrace.results.checkpoint import Checkpoint
+from ropetrace.types import Cloud, Estimate, Frame
+
+
+class NpzWriter(Closing):
+    """Arrays that ``numpy.load(path, allow_pickle=False)`` reads.
+
+    One entry a frame, F in all: ``frame``, ``stamp_ns``, ``status``, ``reasons`` (one a line) and
+    ``point_count``. All frames end to end: ``nodes (sum M, 3)``, ``positions (sum W, 3)``, ``quaternions
+    (sum W, 4)`` and ``arc_length (sum W,)``. ``node_offset`` and ``waypoint_offset`` have F + 1 entries: the
+    waypoints of frame i are ``positions[waypoint_offset[i]:waypoint_offset[i + 1]]``. ``metadata`` is a JSON
+    text, ``frame_name`` in it.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be created or written.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool, frame_name: str, metadata: Mapping[str, str]) -> None:
+        self._metadata = json.dumps({**metadata, "frame_name": frame_name}, ensure_ascii=False)
+        self._frames: list[tuple[int, int, str, str, int]] = []
+        self._node_offset = [0]
+        self._waypoint_offset = [0]
+        self._parts: dict[str, list[NDArray[Any]]] = {
+            "nodes": [np.empty((0, 3))],
+            "positions": [np.empty((0, 3))],
+            "quaternions": [np.empty((0, 4))],
+            "arc_length": [np.empty(0)],
+        }
+        self._closed = False
+        self._checkpoint = Checkpoint(path, overwrite, self._save)
+
+    def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
+        waypoints = estimate.waypoints
+        self._frames.append(
+            (
+                index,
+                estimate.stamp_ns,
+                str(estimate.status),
+                "\n".join(estimate.reasons),
+                estimate.point_count,
+            )
+        )
+        self._node_offset.append(self._node_offset[-1] + len(estimate.nodes))
+        self._waypoint_offset.append(self._waypoint_offset[-1] + len(waypoints))
+        self._parts["nodes"].append(estimate.nodes)
+        self._parts["positions"].append(waypoints.positions)
+        self._parts["quaternions"].append(waypoints.quaternions)
+        self._parts["arc_length"].append(waypoints.arc_length)
+        self._checkpoint.write_if_due()
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            self._checkpoint.write(last=True)
+
+    def _save(self, file: BinaryIO) -> None:
+        for name, parts in self._parts.items():
+            self._parts[name] = [np.concatenate(parts)]
+        frame, stamp_ns, status, reasons, point_count = zip(*self._frames, strict=True) if self._frames else ((),) * 5
+        np.savez(
+            file,
+            frame=np.array(frame, np.int64),
+            stamp_ns=np.array(stamp_ns, np.int64),
+            status=np.array(status, np.str_),
+            reasons=np.array(reasons, np.str_),
+            point_count=np.array(point_count, np.int64),
+            node_offset=np.array(self._node_offset, np.int64),
+            waypoint_offset=np.array(self._waypoint_offset, np.int64),
+            metadata=np.array(self._metadata),
+            allow_pickle=False,
+            **{name: parts[0] for name, parts in self._parts.items()},
+        )

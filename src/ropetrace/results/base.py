@@ -1,0 +1,182 @@
+"""What every writer of results shares: the protocol, the check of the path, the words of an error."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import BinaryIO, Protocol, Self
+
+from ropetrace.errors import OutputError
+from ropetrace.types import Cloud, Estimate, Frame
+
+STATUS_COLUMNS = ("frame", "stamp_ns", "waypoint", "status")
+"""The columns of a row that say what it belongs to."""
+
+FLOAT_COLUMNS = ("arc_length", "x", "y", "z", "qx", "qy", "qz", "qw")
+"""The columns of a row that hold the waypoint: metres, and a quaternion."""
+
+COLUMNS = STATUS_COLUMNS + FLOAT_COLUMNS
+"""The columns of the table formats, in order."""
+
+
+class ResultWriter(Protocol):
+    """Takes the estimates of a run, one call a frame. A context manager that closes itself."""
+
+    def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
+        """Add the estimate of one frame.
+
+        Parameters
+        ----------
+        index : int
+            The frame's place in its recording.
+        estimate : Estimate
+            Written as given: transform it before.
+        frame, cloud : optional
+            What the estimate was made of; for the formats that show pictures.
+
+        Raises
+        ------
+        OutputError
+            If it cannot be written.
+        """
+
+    def close(self) -> None:
+        """Finish the file; a second call does nothing."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+
+class Closing:
+    """The context-manager half of a writer."""
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # A disk that is full fails twice, in write and in close: what the user must see is the first.
+        with contextlib.suppress(OutputError) if error is not None else contextlib.nullcontext():
+            self.close()
+
+
+def cannot_write(path: Path, error: OSError) -> OutputError:
+    """The one line for a file that the operating system refuses."""
+    return OutputError(f"{path}: cannot be written: {error.strerror or error}")
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn the operating system's refusals into an OutputError that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+def check_place(path: Path) -> None:
+    """Raise an OutputError if no file can be at this path."""
+    with writing(path):
+        if path.is_dir():
+            raise OutputError(f"{path} is a folder: give the name of a file")
+        if not path.parent.is_dir():
+            raise OutputError(f"{path}: the folder {path.parent} does not exist")
+
+
+def create(path: Path, overwrite: bool, buffering: int = -1) -> BinaryIO:
+    """Open a new file.
+
+    Raises
+    ------
+    OutputError
+        If the file exists and `overwrite` is not set, or it cannot be made.
+    """
+    check_place(path)
+    try:
+        return open(path, "wb" if overwrite else "xb", buffering=buffering)
+    except FileExistsError:
+        raise OutputError(f"{path} exists already: choose another name or give --overwrite") from None
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold back Ctrl-C and SIGTERM until the block is done, so that they never leave half a frame behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[tuple[int, FrameType | None]] = []
+    previous = {
+        number: signal.signal(number, lambda number, frame: held.append((number, frame)))
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(number) is not None
+    }
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+        for late, frame in held:
+            handler = previous[signal.Signals(late)]
+            if callable(handler):
+                handler(late, frame)
+            elif handler is signal.SIG_DFL:
+                signal.raise_signal(late)
+
+
+class WholeFile:
+    """A file that takes each piece of data whole or, where the disk is full, not at all.
+
+    There is no buffer in the process: when `append` returns the system has the data, and a kill cannot take
+    them.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be created or written.
+    """
+
+    def __init__(self, path: Path, overwrite: bool) -> None:
+        self._path = path
+        self._file = create(path, overwrite, buffering=0)
+        self.size = 0
+
+    @contextlib.contextmanager
+    def closed_on_error(self) -> Iterator[None]:
+        """For the constructor of a writer, which nobody closes if it fails."""
+        try:
+            yield
+        except BaseException:
+            self._file.close()
+            raise
+
+    def append(self, data: bytes | bytearray) -> None:
+        """Write all of the data, or raise and leave the file as it was."""
+        written = 0
+        with writing(self._path), uninterrupted(), memoryview(data) as view:
+            try:
+                while written < len(view):
+                    written += self._file.write(view[written:])
+            except OSError:
+                with contextlib.suppress(OSError):
+                    self._file.seek(self.size)
+                    self._file.truncate()
+                raise
+            self.size += written
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        with writing(self._path):
+            self._file.close()

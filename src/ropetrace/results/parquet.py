@@ -1,0 +1,83 @@
+"""Results as Parquet: the rows of the CSV, typed and compressed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from ropetrace.errors import import_extra
+from ropetrace.results.base import FLOAT_COLUMNS, Closing
+from ropetrace.results.checkpoint import Checkpoint
+from ropetrace.types import Cloud, Estimate, Frame
+
+arrow: Any = import_extra("pyarrow", "parquet")
+arrow_parquet: Any = import_extra("pyarrow.parquet", "parquet")
+
+
+class ParquetWriter(Closing):
+    """One row a waypoint; a frame without waypoints is one row with nulls.
+
+    The metadata are key-values of the schema, `frame_name` among them.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be created or written.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool, frame_name: str, metadata: Mapping[str, str]) -> None:
+        self._schema = arrow.schema(
+            [
+                ("frame", arrow.int64()),
+                ("stamp_ns", arrow.int64()),
+                ("waypoint", arrow.int32()),
+                ("status", arrow.string()),
+                *((name, arrow.float64()) for name in FLOAT_COLUMNS),
+            ],
+            metadata={**metadata, "frame_name": frame_name},
+        )
+        self._batches: list[Any] = []
+        self._closed = False
+        self._checkpoint = Checkpoint(path, overwrite, self._save)
+
+    def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
+        waypoints = estimate.waypoints
+        count = len(waypoints)
+        rows = max(count, 1)
+        numbers: list[Any]
+        if count:
+            values = np.column_stack((waypoints.arc_length, waypoints.positions, waypoints.quaternions))
+            numbers = [np.arange(count, dtype=np.int32), *np.ascontiguousarray(values.T)]
+        else:
+            numbers = [
+                arrow.nulls(1, arrow.int32()),
+                *([arrow.nulls(1, arrow.float64())] * len(FLOAT_COLUMNS)),
+            ]
+        waypoint, *floats = numbers
+        self._batches.append(
+            arrow.record_batch(
+                [
+                    np.full(rows, index, np.int64),
+                    np.full(rows, estimate.stamp_ns, np.int64),
+                    waypoint,
+                    arrow.array([str(estimate.status)] * rows),
+                    *floats,
+                ],
+                schema=self._schema,
+            )
+        )
+        self._checkpoint.write_if_due()
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            self._checkpoint.write(last=True)
+
+    def _save(self, file: BinaryIO) -> None:
+        # One contiguous batch: many small ones cost more memory and time at every checkpoint that follows.
+        table = arrow.Table.from_batches(self._batches, self._schema).combine_chunks()
+        arrow_parquet.write_table(table, file)
+        self._batches = table.to_batches()

@@ -1,0 +1,137 @@
+"""Results as MCAP with ROS 2 messages, for Foxglove, RViz and ``ros2 bag``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any, cast
+
+import numpy as np
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_typestore
+
+from ropetrace.errors import OutputError
+from ropetrace.results.base import Closing, WholeFile, uninterrupted
+from ropetrace.types import Cloud, Estimate, Frame, Status
+
+CENTERLINE_TOPIC = "/ropetrace/centerline"
+STATUS_TOPIC = "/ropetrace/status"
+
+NANOSECONDS = 1_000_000_000
+LAST_STAMP = (1 << 31) * NANOSECONDS - 1
+"""The last stamp that a ROS time holds."""
+
+
+class McapWriter(Closing):
+    """A `nav_msgs/msg/Path` and a `diagnostic_msgs/msg/DiagnosticArray` a frame.
+
+    A lost frame is a path without poses, which clears the curve in a viewer. Each frame is a chunk of its
+    own, with a checksum, and reaches the system before `write` returns: a process that is killed loses no
+    frame that was written. The metadata are the record ``ropetrace``, `frame_name` among them.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be created or written, or a stamp does not fit a ROS time: before 1970, after 2038.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool, frame_name: str, metadata: Mapping[str, str]) -> None:
+        self._path = path
+        self._frame_id = "camera_color_optical_frame" if frame_name == "camera" else frame_name
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self._file = WholeFile(path, overwrite)
+        writer: Any = Writer(cast(IO[bytes], _FrameStream(self._file)), enable_data_crcs=True)
+        self._writer = writer
+        self._sequence = 0
+        self._closed = False
+        self._broken = False
+        with self._file.closed_on_error():
+            self._writer.start(profile="ros2", library="ropetrace")
+            self._writer.add_metadata("ropetrace", {**metadata, "frame_name": frame_name})
+            self._centerline = self._channel(CENTERLINE_TOPIC, "nav_msgs/msg/Path")
+            self._status = self._channel(STATUS_TOPIC, "diagnostic_msgs/msg/DiagnosticArray")
+            self._writer.flush()
+
+    def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
+        stamp_ns = estimate.stamp_ns
+        if not 0 <= stamp_ns <= LAST_STAMP:
+            raise OutputError(f"{self._path}: frame {index}: the stamp {stamp_ns} ns does not fit a ROS time")
+        types = self._store.types
+        time = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
+        header = types["std_msgs/msg/Header"](time, self._frame_id)
+        messages = (
+            (self._centerline, self._path_message(header, estimate), "nav_msgs/msg/Path"),
+            (self._status, self._status_message(header, estimate), "diagnostic_msgs/msg/DiagnosticArray"),
+        )
+        packed = [(channel, self._store.serialize_cdr(message, name)) for channel, message, name in messages]
+        try:
+            with uninterrupted():
+                for channel, data in packed:
+                    self._writer.add_message(channel, stamp_ns, bytes(data), stamp_ns, self._sequence)
+                self._sequence += 1
+                self._writer.flush()
+        except OutputError:
+            self._broken = True
+            raise
+
+    def close(self) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            # The index of a file that lacks a frame would be wrong; without it the frames before can be read.
+            if not self._broken:
+                with uninterrupted():
+                    self._writer.finish()
+                    self._writer.flush()
+        finally:
+            self._file.close()
+
+    def _channel(self, topic: str, name: str) -> int:
+        text, _ = self._store.generate_msgdef(name, ros_version=2)
+        schema = self._writer.register_schema(name, "ros2msg", text.encode())
+        return int(self._writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""}))
+
+    def _path_message(self, header: Any, estimate: Estimate) -> Any:
+        types = self._store.types
+        pose_stamped, pose = types["geometry_msgs/msg/PoseStamped"], types["geometry_msgs/msg/Pose"]
+        point, quaternion = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Quaternion"]
+        rows = np.hstack((estimate.waypoints.positions, estimate.waypoints.quaternions)).tolist()
+        return types["nav_msgs/msg/Path"](
+            header, [pose_stamped(header, pose(point(*row[:3]), quaternion(*row[3:]))) for row in rows]
+        )
+
+    def _status_message(self, header: Any, estimate: Estimate) -> Any:
+        types = self._store.types
+        status, pair = types["diagnostic_msgs/msg/DiagnosticStatus"], types["diagnostic_msgs/msg/KeyValue"]
+        level = {Status.OK: status.OK, Status.DEGRADED: status.WARN, Status.LOST: status.ERROR}[estimate.status]
+        # A file name in a reason may hold bytes that are no UTF-8.
+        message = "; ".join(estimate.reasons).encode(errors="replace").decode() or str(estimate.status)
+        values = {
+            "status": str(estimate.status),
+            "point_count": str(estimate.point_count),
+            "nodes": str(len(estimate.nodes)),
+            "length": repr(estimate.waypoints.length),
+        }
+        return types["diagnostic_msgs/msg/DiagnosticArray"](
+            header, [status(level, "ropetrace", message, "", [pair(*item) for item in values.items()])]
+        )
+
+
+class _FrameStream:
+    """What the MCAP writer writes to: keeps it until `flush`, which hands it on whole."""
+
+    def __init__(self, file: WholeFile) -> None:
+        self._file = file
+        self._pending = bytearray()
+
+    def write(self, data: bytes) -> int:
+        self._pending += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._file.size + len(self._pending)
+
+    def flush(self) -> None:
+        self._file.append(self._pending)
+        self._pending.clear()

@@ -1,0 +1,246 @@
+"""Rerun: every picture of a run in one place. A sink: nothing here feeds back into the tracking."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ropetrace.errors import import_extra
+from ropetrace.types import Cloud, CloudFrame, Estimate, FloatArray, Frame, RgbdFrame, Status, Waypoints
+
+rr: Any = import_extra("rerun", "viewer")
+rrb: Any = import_extra("rerun.blueprint", "viewer")
+
+IMAGE_WIDTH = 640
+"""Wider images are thinned to at most this many columns: they are looked at, not measured."""
+
+AXES = 12
+"""About how many waypoint frames are drawn; more would hide the rope."""
+
+SCENE_POINTS = 50_000
+"""About how many points of a whole cloud are drawn."""
+
+CLOUD_POINTS = 3_000
+"""About how many points of the rope are drawn: few enough to see the centreline among them."""
+
+STATUS_COLORS = {Status.OK: (60, 220, 90), Status.DEGRADED: (255, 170, 30), Status.LOST: (240, 70, 60)}
+STATUS_LEVELS = {Status.OK: "INFO", Status.DEGRADED: "WARN", Status.LOST: "ERROR"}
+
+NODE_COLORS = np.array(
+    [
+        (240, 96, 96),
+        (80, 170, 255),
+        (250, 200, 60),
+        (170, 110, 250),
+        (80, 220, 190),
+        (250, 120, 210),
+        (160, 210, 70),
+    ],
+    np.uint8,
+)
+"""Given in turn along the chain, so that the cuts between slices show."""
+
+NO_NODE_COLOR = (110, 110, 110)
+
+NO_METADATA: Mapping[str, str] = MappingProxyType({})
+
+
+def new_recording() -> Any:
+    """A `rerun.RecordingStream` of its own, whose only clocks are the frame's index and its stamp."""
+    recording = rr.RecordingStream("ropetrace")
+    recording.set_log_time_enabled(False)
+    return recording
+
+
+def default_blueprint() -> Any:
+    """How the viewer shows a run: the rope in 3-D, the image with the centreline in it, plots, the status."""
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Spatial3DView(name="Rope", origin="/", contents=["+ /**", "- /camera/**"], line_grid=False),
+            rrb.Vertical(
+                rrb.Tabs(
+                    *(
+                        rrb.Spatial2DView(
+                            name=name.capitalize(),
+                            origin="/camera",
+                            contents=["+ /camera", f"+ /camera/{name}", "+ /rope/centerline"],
+                        )
+                        for name in ("image", "depth")
+                    ),
+                    active_tab=0,
+                ),
+                rrb.Horizontal(
+                    rrb.TimeSeriesView(name="Length (m)", origin="/plots/length"),
+                    rrb.TimeSeriesView(name="Points", origin="/plots/point_count"),
+                ),
+                rrb.TextLogView(name="Status", origin="/status"),
+                row_shares=[3, 1.5, 1],
+            ),
+            column_shares=[3, 2],
+        ),
+        rrb.TimePanel(state="collapsed", timeline="frame"),
+        collapse_panels=True,
+    )
+
+
+class RerunLog:
+    """Logs a run to a Rerun recording, on the timelines ``frame`` (its index) and ``time`` (its stamp).
+
+    The entities are ``/camera`` with ``image`` (the colour; the depth, if that is all) and ``depth``;
+    ``/scene``, a frame's whole cloud; ``/rope`` with ``cloud``, ``nodes``, ``centerline`` and ``axes``;
+    ``/status``; ``/plots`` with ``length`` and ``point_count``.
+
+    Parameters
+    ----------
+    recording : rerun.RecordingStream
+        Where to log; whether it leads to a file, a viewer or a server is the caller's affair.
+    frame_name : str
+        The frame of the estimates.
+    frame_from_camera : (4, 4) float array, optional
+        The camera's pose in that frame; not needed if that is ``camera``. If it is not known, the images are
+        shown but not placed in space.
+    metadata : mapping of str to str
+        Shown as texts under ``/metadata``.
+    """
+
+    def __init__(
+        self,
+        recording: Any,
+        *,
+        frame_name: str = "camera",
+        frame_from_camera: FloatArray | None = None,
+        metadata: Mapping[str, str] = NO_METADATA,
+    ) -> None:
+        self._recording = recording
+        self._pose = np.eye(4) if frame_name == "camera" else frame_from_camera
+        self._camera: Any = None
+        self._reported: tuple[Status, tuple[str, ...]] | None = None
+        axes = rr.ViewCoordinates.RDF if frame_name == "camera" else rr.ViewCoordinates.RIGHT_HAND_Z_UP
+        recording.log("/", axes, static=True)
+        if self._pose is not None:
+            pose = rr.Transform3D(translation=self._pose[:3, 3], mat3x3=self._pose[:3, :3])
+            recording.log("camera", pose, static=True)
+            recording.log("scene", pose, static=True)
+        for name, text in {**metadata, "frame_name": frame_name}.items():
+            recording.log(f"metadata/{name}", rr.TextDocument(text), static=True)
+
+    def log(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
+        """Log one frame; what it lacks is cleared, so that no picture outlives its frame.
+
+        Parameters
+        ----------
+        index : int
+            The frame's place in its recording.
+        estimate : Estimate
+            What the tracker says.
+        frame : RgbdFrame or CloudFrame, optional
+            What the tracker saw.
+        cloud : Cloud, optional
+            The points that it took for the rope.
+        """
+        self._recording.set_time("frame", sequence=index)
+        self._recording.set_time("time", timestamp=np.datetime64(estimate.stamp_ns, "ns"))
+        self._log_images(frame)
+        self._log_scene(frame)
+        self._log_rope(estimate, cloud)
+        self._log_status(estimate)
+
+    def _log_images(self, frame: Frame | None) -> None:
+        if not isinstance(frame, RgbdFrame):
+            if self._camera is not None:
+                self._recording.log("camera/image", rr.Clear(recursive=False))
+                self._recording.log("camera/depth", rr.Clear(recursive=False))
+            return
+        step = -(-frame.intrinsics.width // IMAGE_WIDTH)
+        self._log_camera(frame, step)
+        depth = rr.DepthImage(frame.depth[::step, ::step], meter=1 / frame.depth_unit_m, colormap="Viridis")
+        if frame.color is None:
+            self._recording.log("camera/image", depth)
+        else:
+            self._recording.log("camera/image", rr.Image(frame.color[::step, ::step]).compress(jpeg_quality=80))
+            self._recording.log("camera/depth", depth)
+
+    def _log_camera(self, frame: RgbdFrame, step: int) -> None:
+        camera = frame.intrinsics
+        if camera == self._camera:
+            return
+        self._camera = camera
+        if self._pose is None:
+            return
+        self._recording.log(
+            "camera",
+            rr.Pinhole(
+                width=-(-camera.width // step),
+                height=-(-camera.height // step),
+                focal_length=(camera.fx / step, camera.fy / step),
+                # Rerun's pixel centres lie at halves, ours at whole numbers.
+                principal_point=(camera.cx / step + 0.5, camera.cy / step + 0.5),
+                camera_xyz=rr.ViewCoordinates.RDF,
+                image_plane_distance=0.1,
+            ),
+        )
+
+    def _log_scene(self, frame: Frame | None) -> None:
+        if not isinstance(frame, CloudFrame):
+            return
+        step = -(-len(frame.points) // SCENE_POINTS) or 1
+        colors = NO_NODE_COLOR if frame.colors is None else frame.colors[::step]
+        self._recording.log("scene", rr.Points3D(frame.points[::step], colors=colors, radii=rr.Radius.ui_points(1.0)))
+
+    def _log_rope(self, estimate: Estimate, cloud: Cloud | None) -> None:
+        self._recording.log("rope", rr.Clear(recursive=True))
+        if cloud is not None:
+            step = -(-len(cloud.points) // CLOUD_POINTS) or 1
+            node = cloud.node[::step]
+            colors = np.where(
+                node[:, None] >= 0, NODE_COLORS[node % len(NODE_COLORS)], np.array(NO_NODE_COLOR, np.uint8)
+            )
+            self._recording.log(
+                "rope/cloud", rr.Points3D(cloud.points[::step], colors=colors, radii=rr.Radius.ui_points(1.0))
+            )
+        if len(estimate.nodes):
+            colors = NODE_COLORS[np.arange(len(estimate.nodes)) % len(NODE_COLORS)]
+            self._recording.log(
+                "rope/nodes", rr.Points3D(estimate.nodes, colors=colors, radii=rr.Radius.ui_points(5.0))
+            )
+        if len(estimate.waypoints):
+            self._recording.log(
+                "rope/centerline",
+                rr.LineStrips3D(
+                    [estimate.waypoints.positions],
+                    colors=STATUS_COLORS[estimate.status],
+                    radii=rr.Radius.ui_points(1.75),
+                ),
+            )
+            self._recording.log("rope/axes", _axes(estimate.waypoints))
+
+    def _log_status(self, estimate: Estimate) -> None:
+        self._recording.log("plots/length", rr.Scalars(estimate.waypoints.length))
+        self._recording.log("plots/point_count", rr.Scalars(estimate.point_count))
+        if self._reported == (estimate.status, estimate.reasons):
+            return
+        self._reported = (estimate.status, estimate.reasons)
+        text = ": ".join(filter(None, (str(estimate.status), "; ".join(estimate.reasons))))
+        self._recording.log(
+            "status",
+            rr.TextLog(text, level=STATUS_LEVELS[estimate.status], color=STATUS_COLORS[estimate.status]),
+        )
+
+
+def _axes(waypoints: Waypoints) -> Any:
+    """Arrows for the frames of about `AXES` waypoints: X (along the rope) red, Y green, Z blue."""
+    step = -(-len(waypoints) // AXES)
+    positions = waypoints.positions[::step]
+    size = max(0.6 * waypoints.length / AXES, 0.002)
+    # The columns of a rotation matrix are the frame's axes.
+    axes = size * Rotation.from_quat(waypoints.quaternions[::step]).as_matrix().transpose(0, 2, 1)
+    return rr.Arrows3D(
+        origins=np.repeat(positions, 3, axis=0),
+        vectors=axes.reshape(-1, 3),
+        colors=np.tile(np.array([(255, 60, 60), (60, 200, 60), (70, 110, 255)], np.uint8), (len(positions), 1)),
+        radii=rr.Radius.ui_points(1.5),
+    )

@@ -1,0 +1,464 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from rerun.chunk import RrdReader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from result_examples import FIRST_STAMP, REASONS, cloud, estimate, estimates, frame
+from ropetrace.errors import MissingExtraError, OutputError
+from ropetrace.results import FORMATS, checkpoint, open_writer
+from ropetrace.results.base import COLUMNS, FLOAT_COLUMNS, uninterrupted
+from ropetrace.types import Estimate
+
+ENDINGS = list(FORMATS)
+METADATA = {"config": 'diameter = 0.012\ncolor = "#c8281e"\n', "note": "naïve ≈ длина"}
+STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+@pytest.fixture
+def eager(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write at once what would wait for a second."""
+    monkeypatch.setattr(checkpoint, "SHORTEST_INTERVAL", 0.0)
+    monkeypatch.setattr(checkpoint, "REST", 0)
+
+
+def record(path: Path, items: list[Estimate], **options: Any) -> None:
+    with open_writer(path, **options) as writer:
+        for index, item in enumerate(items):
+            writer.write(10 + index, item)
+
+
+def expected_rows(items: list[Estimate]) -> list[tuple[Any, ...]]:
+    rows: list[tuple[Any, ...]] = []
+    for index, item in enumerate(items):
+        waypoints = item.waypoints
+        if not len(waypoints):
+            rows.append((10 + index, item.stamp_ns, None, str(item.status), *[None] * len(FLOAT_COLUMNS)))
+        values = zip(
+            waypoints.arc_length.tolist(),
+            waypoints.positions.tolist(),
+            waypoints.quaternions.tolist(),
+            strict=True,
+        )
+        for number, (arc_length, position, quaternion) in enumerate(values):
+            rows.append((10 + index, item.stamp_ns, number, str(item.status), arc_length, *position, *quaternion))
+    return rows
+
+
+def rrd_frames(path: Path) -> set[int]:
+    """The frames whose length is logged in a Rerun recording, whether it was finished or not."""
+    frames: set[int] = set()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for chunk in RrdReader(path).stream():
+            if chunk.entity_path == "/plots/length":
+                frames |= set(chunk.to_record_batch().column("frame").to_pylist())
+    return frames
+
+
+def mcap_messages(path: Path, finished: bool) -> Iterator[tuple[int, Any]]:
+    """The frames' numbers and paths; of a file without an end, all that is whole."""
+    with path.open("rb") as file:
+        if finished:
+            for schema, _, message in make_reader(file, validate_crcs=True).iter_messages():
+                assert schema is not None
+                if schema.name == "nav_msgs/msg/Path":
+                    yield message.sequence, STORE.deserialize_cdr(message.data, schema.name)
+            return
+        try:
+            for item in StreamReader(file, validate_crcs=True).records:
+                if isinstance(item, Message) and item.channel_id == 1:
+                    yield item.sequence, STORE.deserialize_cdr(item.data, "nav_msgs/msg/Path")
+        except McapError:
+            return
+
+
+def frames_in(path: Path, finished: bool = True) -> list[int]:
+    """The numbers of the frames that can be read from a file of any format."""
+    if path.suffix == ".csv":
+        text = path.read_text()
+        assert text.endswith("\n")
+        return sorted({int(row["frame"]) for row in csv.DictReader(text.splitlines())})
+    if path.suffix == ".parquet":
+        return sorted(set(pyarrow.parquet.read_table(path)["frame"].to_pylist()))
+    if path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as arrays:
+            return [int(number) for number in arrays["frame"]]
+    if path.suffix == ".mcap":
+        return sorted(number for number, _ in mcap_messages(path, finished))
+    return sorted(rrd_frames(path))
+
+
+def test_csv_is_exact(tmp_path: Path) -> None:
+    items = estimates(10)
+    record(tmp_path / "run.csv", items, metadata=METADATA)
+    text = (tmp_path / "run.csv").read_bytes().decode()
+    assert "\r" not in text
+    header, *rows = csv.reader(text.splitlines())
+    assert ",".join(header) == "frame,stamp_ns,waypoint,status,arc_length,x,y,z,qx,qy,qz,qw"
+    kinds = (int, int, int, str, *[float] * 8)
+    read = [tuple(kind(cell) if cell else None for kind, cell in zip(kinds, row, strict=True)) for row in rows]
+    assert read == expected_rows(items)
+
+
+def test_parquet_is_exact(tmp_path: Path) -> None:
+    items = estimates(10)
+    record(tmp_path / "run.parquet", items, frame_name="world", metadata=METADATA)
+    table = pyarrow.parquet.read_table(tmp_path / "run.parquet")
+    assert tuple(table.column_names) == COLUMNS
+    assert [tuple(row.values()) for row in table.to_pylist()] == expected_rows(items)
+    kept = {key.decode(): value.decode() for key, value in table.schema.metadata.items()}
+    assert kept == {**METADATA, "frame_name": "world"}
+
+
+def test_npz_is_exact(tmp_path: Path) -> None:
+    items = estimates(10)
+    record(tmp_path / "run.npz", items, metadata=METADATA)
+    with np.load(tmp_path / "run.npz", allow_pickle=False) as arrays:
+        read = dict(arrays)
+    assert read["frame"].tolist() == list(range(10, 20))
+    assert read["stamp_ns"].tolist() == [item.stamp_ns for item in items]
+    assert read["status"].tolist() == [str(item.status) for item in items]
+    assert read["reasons"].tolist() == ["\n".join(item.reasons) for item in items]
+    assert read["point_count"].tolist() == [item.point_count for item in items]
+    nodes, waypoints = read["node_offset"], read["waypoint_offset"]
+    for index, item in enumerate(items):
+        part = slice(waypoints[index], waypoints[index + 1])
+        assert np.array_equal(read["nodes"][nodes[index] : nodes[index + 1]], item.nodes)
+        assert np.array_equal(read["positions"][part], item.waypoints.positions)
+        assert np.array_equal(read["quaternions"][part], item.waypoints.quaternions)
+        assert np.array_equal(read["arc_length"][part], item.waypoints.arc_length)
+    assert len(read["positions"]) == waypoints[-1]
+    assert json.loads(str(read["metadata"])) == {**METADATA, "frame_name": "camera"}
+
+
+@pytest.mark.parametrize(("frame_name", "frame_id"), [("camera", "camera_color_optical_frame"), ("world", "world")])
+def test_mcap_is_read_by_rosbags(tmp_path: Path, frame_name: str, frame_id: str) -> None:
+    items = estimates(10)
+    record(tmp_path / "run.mcap", items, frame_name=frame_name)
+    paths: list[tuple[int, Any]] = []
+    statuses: list[tuple[int, Any]] = []
+    with AnyReader([tmp_path / "run.mcap"]) as reader:
+        for connection, time_ns, data in reader.messages():
+            message: Any = reader.deserialize(data, connection.msgtype)
+            stamp = message.header.stamp
+            assert (stamp.sec * 10**9 + stamp.nanosec, message.header.frame_id) == (time_ns, frame_id)
+            (paths if connection.topic == "/ropetrace/centerline" else statuses).append((time_ns, message))
+    assert [time_ns for time_ns, _ in paths] == [time_ns for time_ns, _ in statuses] == [i.stamp_ns for i in items]
+    for item, (_, path), (_, array) in zip(items, paths, statuses, strict=True):
+        poses = [pose.pose for pose in path.poses]
+        positions = [(pose.position.x, pose.position.y, pose.position.z) for pose in poses]
+        turns = [(p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w) for p in poses]
+        assert np.array_equal(np.reshape(positions, (-1, 3)), item.waypoints.positions)
+        assert np.array_equal(np.reshape(turns, (-1, 4)), item.waypoints.quaternions)
+        (status,) = array.status
+        assert status.level == {"ok": 0, "degraded": 1, "lost": 2}[item.status]
+        assert status.message == ("; ".join(item.reasons) or "ok")
+        values = {pair.key: pair.value for pair in status.values}
+        assert (values["point_count"], values["nodes"]) == (str(item.point_count), str(len(item.nodes)))
+        assert float(values["length"]) == item.waypoints.length
+    assert statuses[3][1].status[0].message == "; ".join(REASONS)
+
+
+def test_mcap_has_checksums_schemas_and_metadata(tmp_path: Path) -> None:
+    record(tmp_path / "run.mcap", estimates(10), metadata=METADATA)
+    with (tmp_path / "run.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 20
+        assert reader.get_header().profile == "ros2"
+        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+        texts = {schema.name: schema.data.decode() for schema in summary.schemas.values()}
+        assert "MSG: geometry_msgs/PoseStamped" in texts["nav_msgs/msg/Path"]
+        assert "MSG: diagnostic_msgs/KeyValue" in texts["diagnostic_msgs/msg/DiagnosticArray"]
+        assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
+        (metadata,) = reader.iter_metadata()
+        assert (metadata.name, metadata.metadata) == ("ropetrace", {**METADATA, "frame_name": "camera"})
+    assert frames_in(tmp_path / "run.mcap") == list(range(10))
+
+
+def test_no_flipped_bit_of_an_mcap_changes_data(tmp_path: Path) -> None:
+    path, broken = tmp_path / "run.mcap", tmp_path / "broken.mcap"
+    record(path, estimates(5))
+
+    def read(path: Path) -> list[tuple[str, int, int, bytes]]:
+        with path.open("rb") as file:
+            return [
+                (channel.topic, message.sequence, message.log_time, message.data)
+                for _, channel, message in make_reader(file, validate_crcs=True).iter_messages()
+            ]
+
+    sound, data = read(path), path.read_bytes()
+    random = np.random.default_rng(0)
+    refused = 0
+    for _ in range(150):
+        changed = bytearray(data)
+        changed[random.integers(len(data))] ^= 1 << int(random.integers(8))
+        broken.write_bytes(changed)
+        try:
+            assert read(broken) == sound
+        except AssertionError:
+            raise
+        except Exception:
+            refused += 1
+    assert refused > 50
+
+
+@pytest.mark.parametrize("stamp_ns", [-1, 2**31 * 10**9])
+def test_mcap_refuses_a_stamp_that_ros_cannot_hold(tmp_path: Path, stamp_ns: int) -> None:
+    with open_writer(tmp_path / "run.mcap") as writer:
+        with pytest.raises(OutputError, match=f"frame 7: the stamp {stamp_ns} ns does not fit"):
+            writer.write(7, Estimate.lost(stamp_ns, "nothing"))
+        writer.write(8, Estimate.lost(0, "nothing"))
+    assert len(frames_in(tmp_path / "run.mcap")) == 1
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_run_without_frames_is_readable(tmp_path: Path, ending: str) -> None:
+    record(tmp_path / f"run{ending}", [])
+    assert frames_in(tmp_path / f"run{ending}") == []
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_an_existing_file_needs_overwrite(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"run{ending}"
+    path.write_text("precious")
+    with pytest.raises(OutputError, match=r"exists already.*--overwrite"):
+        open_writer(path)
+    assert path.read_text() == "precious"
+    record(path, estimates(3), overwrite=True)
+    assert len(frames_in(path)) == 3
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_impossible_places_are_refused_in_one_line(tmp_path: Path, ending: str) -> None:
+    (tmp_path / f"folder{ending}").mkdir()
+    (tmp_path / "file").touch()
+    (tmp_path / f"dangling{ending}").symlink_to(tmp_path / "missing" / "run")
+    places = {
+        f"folder{ending}": "is a folder",
+        f"missing/run{ending}": "the folder .*missing does not exist",
+        f"file/run{ending}": "the folder .*file does not exist",
+        f"{'n' * 300}{ending}": "cannot be written: File name too long",
+    }
+    for name, message in places.items():
+        for overwrite in (False, True):
+            with pytest.raises(OutputError, match=message) as raised:
+                open_writer(tmp_path / name, overwrite=overwrite)
+            assert "\n" not in str(raised.value)
+    with pytest.raises(OutputError, match="exists already"):
+        open_writer(tmp_path / f"dangling{ending}")
+    assert sorted(os.listdir(tmp_path)) == sorted([f"folder{ending}", "file", f"dangling{ending}"])
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="gives up the rights of root")
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_folder_without_permission_is_refused(tmp_path: Path, ending: str) -> None:
+    for folder in (tmp_path, *list(tmp_path.parents)[:2]):
+        folder.chmod(0o755)
+    open_writer(tmp_path / f"first{ending}").close()
+    os.seteuid(65534)
+    try:
+        with pytest.raises(OutputError, match="Permission denied"):
+            open_writer(tmp_path / f"run{ending}")
+    finally:
+        os.seteuid(0)
+
+
+@pytest.mark.parametrize("name", ["run", "run.txt", "run.csv.gz", ".csv", "/dev/full"])
+def test_an_unknown_ending_lists_the_known(tmp_path: Path, name: str) -> None:
+    with pytest.raises(OutputError, match=r"use \.csv, \.parquet, \.npz, \.mcap, \.rrd"):
+        open_writer(tmp_path / name)
+
+
+def test_the_case_of_the_ending_does_not_matter(tmp_path: Path) -> None:
+    record(tmp_path / "RUN.CSV", estimates(1))
+    assert (tmp_path / "RUN.CSV").read_text().startswith("frame,")
+
+
+@pytest.mark.parametrize(("ending", "module"), [(".parquet", "pyarrow"), (".rrd", "rerun")])
+def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, module: str) -> None:
+    for name in ("ropetrace.results.parquet", "ropetrace.results.rrd", "ropetrace.viewer"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'ropetrace\["):
+        open_writer(tmp_path / f"run{ending}")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_an_exception_in_the_block_leaves_a_whole_file(tmp_path: Path, ending: str, error: type[BaseException]) -> None:
+    path = tmp_path / f"run{ending}"
+
+    def stopped() -> None:
+        with open_writer(path) as writer:
+            for index in range(7):
+                writer.write(index, estimate(index), frame(index), cloud(index))
+            raise error
+
+    with pytest.raises(error):
+        stopped()
+    assert frames_in(path) == list(range(7))
+    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.usefixtures("eager")
+@pytest.mark.parametrize("ending", [".csv", ".parquet", ".npz", ".mcap"])
+def test_ctrl_c_at_any_moment_leaves_a_whole_file(tmp_path: Path, ending: str) -> None:
+    items = estimates(10)
+    for attempt in range(4):
+        path, written = tmp_path / f"{attempt}{ending}", 0
+        timer = threading.Timer(0.01 + 0.013 * attempt, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        try:
+            with open_writer(path) as writer:
+                while True:
+                    writer.write(written, items[written % 10])
+                    written += 1
+        except KeyboardInterrupt:
+            pass
+        timer.join()
+        # The frame that was being written when it came is there or not; those before it are.
+        assert frames_in(path) in (list(range(written)), list(range(written + 1)))
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_a_held_signal_comes_after_the_block() -> None:
+    steps = []
+
+    def interrupted() -> None:
+        with uninterrupted():
+            signal.raise_signal(signal.SIGINT)
+            steps.append("done")
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert steps == ["done"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@pytest.mark.usefixtures("eager")
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_full_disk_is_one_line(tmp_path: Path, ending: str) -> None:
+    path, written = tmp_path / f"run{ending}", 0
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    writer = open_writer(path)
+
+    def fill() -> None:
+        nonlocal written
+        with writer:
+            while written < 3000:
+                writer.write(written, estimate(written), frame(written), cloud(written))
+                written += 1
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, hard))
+    try:
+        with pytest.raises(OutputError, match="cannot be written") as raised:
+            fill()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    writer.close()
+    assert "\n" not in str(raised.value)
+    assert str(path) in str(raised.value)
+    read = frames_in(path, finished=False)
+    assert read == list(range(len(read)))
+    if ending != ".rrd":
+        assert written - len(read) <= 1
+    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("ending", [".csv", ".mcap"])
+def test_a_device_that_is_full_is_one_line(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"run{ending}"
+    path.symlink_to("/dev/full")
+    with pytest.raises(OutputError, match="cannot be written: No space left on device"):
+        open_writer(path, overwrite=True)
+
+
+KILLED = """
+import sys
+from result_examples import cloud, estimate, frame
+from ropetrace.results import checkpoint, open_writer
+checkpoint.SHORTEST_INTERVAL = 0.05
+writer = open_writer(sys.argv[1])
+index = 0
+while True:
+    writer.write(index, estimate(index), frame(index), cloud(index))
+    print(index, flush=True)
+    index += 1
+"""
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_kill_minus_nine_leaves_what_was_written(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"run{ending}"
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, path],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+    )
+    assert process.stdout is not None
+    with process:
+        acknowledged = int(process.stdout.readline())
+        started = time.monotonic()
+        while time.monotonic() < started + 0.7:
+            acknowledged = int(process.stdout.readline())
+        process.kill()
+        rest = process.stdout.read().split()
+    acknowledged = max([acknowledged, *map(int, rest)])
+    read = frames_in(path, finished=False)
+    assert read == list(range(len(read)))
+    lost = acknowledged + 1 - len(read)
+    print(f"{ending}: {acknowledged + 1} acknowledged, {lost} lost")
+    if ending in (".csv", ".mcap"):
+        assert lost <= 0
+    else:
+        assert len(read) > 0.3 * acknowledged
+
+
+def test_checkpoints_take_little_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkpoint, "SHORTEST_INTERVAL", 0.01)
+    spent = []
+
+    def save(file: BinaryIO) -> None:
+        time.sleep(0.01)
+        spent.append(0.01)
+
+    started = time.monotonic()
+    point = checkpoint.Checkpoint(tmp_path / "file", overwrite=False, save=save)
+    while time.monotonic() < started + 0.6:
+        point.write_if_due()
+        time.sleep(0.0005)
+    assert len(spent) >= 2
+    assert sum(spent) < 0.15 * 0.6
+
+
+def test_the_stamps_are_nanoseconds(tmp_path: Path) -> None:
+    record(tmp_path / "run.csv", estimates(1))
+    assert (tmp_path / "run.csv").read_text().splitlines()[1].startswith(f"10,{FIRST_STAMP},0,ok,0.0,")

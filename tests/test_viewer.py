@@ -1,0 +1,277 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow
+import pytest
+from rerun.chunk import RrdReader
+
+from result_examples import FIRST_STAMP, REASONS, cloud, estimate, frame
+from ropetrace.errors import OutputError
+from ropetrace.results import live, open_writer
+from ropetrace.results.live import LiveViewer
+from ropetrace.types import Cloud, CloudFrame, Estimate, Frame
+from ropetrace.viewer import AXES, CLOUD_POINTS, IMAGE_WIDTH, NO_NODE_COLOR, NODE_COLORS
+
+Rows = dict[str, dict[int | None, dict[str, Any]]]
+
+
+def logged(path: Path, *steps: tuple[Estimate, Frame | None, Cloud | None], **options: Any) -> Rows:
+    """Write a recording and read it back: by entity, then by frame (None: static), the components."""
+    with open_writer(path, **options) as writer:
+        for index, (item, seen, points) in enumerate(steps):
+            writer.write(index, item, seen, points)
+    rows: Rows = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if "time" in batch.schema.names:
+            column = batch.schema.get_field_index("time")
+            batch = batch.set_column(column, "time", batch.column(column).cast(pyarrow.int64()))
+        for row in batch.to_pylist():
+            row.pop("rerun.controls.RowId")
+            # An entity may be logged twice a frame, a Clear among them.
+            rows.setdefault(chunk.entity_path, {}).setdefault(row.get("frame"), {}).update(row)
+    return rows
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.rrd"
+
+
+def rgb(values: list[int]) -> list[tuple[int, ...]]:
+    """Rerun's 0xRRGGBBAA as triples."""
+    return [(value >> 24, value >> 16 & 255, value >> 8 & 255) for value in values]
+
+
+def test_every_picture_of_a_frame_is_there(path: Path) -> None:
+    item = estimate(0)
+    rows = logged(path, (item, frame(0), cloud(0)), metadata={"config": "diameter = 0.012"})
+    assert {
+        "/",
+        "/camera",
+        "/camera/image",
+        "/camera/depth",
+        "/rope",
+        "/rope/cloud",
+        "/rope/nodes",
+        "/rope/centerline",
+        "/rope/axes",
+        "/status",
+        "/plots/length",
+        "/plots/point_count",
+        "/metadata/config",
+    } <= set(rows)
+    (strip,) = rows["/rope/centerline"][0]["LineStrips3D:strips"]
+    assert np.allclose(strip, item.waypoints.positions, atol=1e-6)
+    assert np.allclose(rows["/rope/nodes"][0]["Points3D:positions"], item.nodes, atol=1e-6)
+    assert rows["/plots/length"][0]["Scalars:scalars"] == [item.waypoints.length]
+    assert rows["/plots/point_count"][0]["Scalars:scalars"] == [item.point_count]
+    assert rows["/metadata/config"][None]["TextDocument:text"] == ["diameter = 0.012"]
+    assert rows["/camera/image"][0]["EncodedImage:media_type"] == ["image/jpeg"]
+    assert rows["/camera/depth"][0]["DepthImage:meter"] == [1000.0]
+
+
+def test_the_timelines_are_the_index_and_the_stamp(path: Path) -> None:
+    rows = logged(path, *((estimate(index), None, None) for index in range(3)))
+    for index, row in rows["/plots/length"].items():
+        assert set(row) == {"frame", "time", "Scalars:scalars"}
+        assert index is not None
+        assert row["time"] == FIRST_STAMP + index * 33_333_333
+
+
+def test_a_lost_frame_clears_the_rope(path: Path) -> None:
+    rows = logged(path, *((estimate(index), frame(index), cloud(index)) for index in range(6)))
+    assert estimate(4).waypoints.positions.size == 0
+    assert rows["/rope"][4]["Clear:is_recursive"] == [True]
+    for name in ("centerline", "nodes", "axes"):
+        assert set(rows[f"/rope/{name}"]) == {0, 1, 2, 3, 5}
+    # What was segmented is what one wants to see then.
+    assert 4 in rows["/rope/cloud"]
+    assert rows["/plots/length"][4]["Scalars:scalars"] == [0.0]
+
+
+def test_a_frame_without_an_image_clears_the_image(path: Path) -> None:
+    rows = logged(path, (estimate(0), frame(0), None), (estimate(1), None, None))
+    for name in ("image", "depth"):
+        assert rows[f"/camera/{name}"][1]["Clear:is_recursive"] == [False]
+
+
+def test_the_status_is_told_when_it_changes(path: Path) -> None:
+    rows = logged(path, *((estimate(index), None, None) for index in range(6)))
+    status = {index: (row["TextLog:level"], row["TextLog:text"]) for index, row in rows["/status"].items()}
+    assert status == {
+        0: (["INFO"], ["ok"]),
+        3: (["WARN"], [f"degraded: {'; '.join(REASONS)}"]),
+        4: (["ERROR"], ["lost: too few points (3 < 25)"]),
+        5: (["INFO"], ["ok"]),
+    }
+
+
+def test_depth_alone_takes_the_place_of_the_colour(path: Path) -> None:
+    rows = logged(path, (estimate(0), frame(0, color=False), None))
+    assert rows["/camera/image"][0]["DepthImage:meter"] == [1000.0]
+    assert "/camera/depth" not in rows
+
+
+@pytest.mark.parametrize("width", [IMAGE_WIDTH, IMAGE_WIDTH + 1, 1280])
+def test_the_projection_fits_the_thinned_image(path: Path, width: int) -> None:
+    seen = frame(0, width=width, height=90)
+    camera = seen.intrinsics
+    rows = logged(path, (estimate(0), seen, None))
+    shown = rows["/camera/depth"][0]["DepthImage:format"][0]
+    pinhole = rows["/camera"][0]
+    assert pinhole["Pinhole:resolution"] == [[shown["width"], shown["height"]]]
+    assert shown["width"] <= IMAGE_WIDTH
+    matrix = np.reshape(pinhole["Pinhole:image_from_camera"], (3, 3)).T
+    # The pixel (column, row) of the thinned image is the pixel (step * column, step * row) of the camera.
+    step = -(-width // IMAGE_WIDTH)
+    point = np.array([0.11, -0.05, 0.9])
+    column = camera.fx * point[0] / point[2] + camera.cx
+    row = camera.fy * point[1] / point[2] + camera.cy
+    projected = (matrix @ point)[:2] / point[2]
+    assert np.allclose(projected, [column / step + 0.5, row / step + 0.5], atol=1e-3)
+
+
+def test_the_camera_is_logged_once(path: Path) -> None:
+    rows = logged(path, *((estimate(index), frame(index), None) for index in range(3)))
+    assert set(rows["/camera"]) == {None, 0}
+
+
+def test_points_have_the_colour_of_their_node(path: Path) -> None:
+    points = cloud(0)
+    rows = logged(path, (estimate(0), None, points))
+    shown = rgb(rows["/rope/cloud"][0]["Points3D:colors"])
+    assert shown[0] == NO_NODE_COLOR
+    for color, node in zip(shown, points.node, strict=True):
+        assert color == (tuple(NODE_COLORS[node]) if node >= 0 else NO_NODE_COLOR)
+    assert rgb(rows["/rope/nodes"][0]["Points3D:colors"])[:2] == [tuple(color) for color in NODE_COLORS[:2]]
+
+
+def test_pictures_stay_small(path: Path) -> None:
+    many = Cloud(np.zeros((10 * CLOUD_POINTS + 1, 3)), np.zeros(10 * CLOUD_POINTS + 1, np.int32))
+    scene = CloudFrame(FIRST_STAMP, np.zeros((200_001, 3), np.float32), np.zeros((200_001, 3), np.uint8))
+    rows = logged(
+        path, (estimate(0), scene, many), (estimate(1), scene, Cloud(np.empty((0, 3)), np.empty(0, np.int32)))
+    )
+    assert len(rows["/rope/cloud"][0]["Points3D:positions"]) <= CLOUD_POINTS
+    assert len(rows["/rope/cloud"][0]["Points3D:colors"]) == len(rows["/rope/cloud"][0]["Points3D:positions"])
+    assert len(rows["/scene"][0]["Points3D:positions"]) <= 50_000
+    assert len(rows["/rope/axes"][0]["Arrows3D:vectors"]) <= 3 * AXES
+
+
+def test_in_another_frame_the_camera_has_its_pose(path: Path) -> None:
+    pose = np.array([[0.0, 0, 1, 1], [-1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]])
+    rows = logged(path, (estimate(0), frame(0), None), frame_name="world", frame_from_camera=pose)
+    assert rows["/camera"][None]["Transform3D:translation"] == [[1.0, 2.0, 3.0]]
+    assert np.array_equal(np.reshape(rows["/camera"][None]["Transform3D:mat3x3"], (3, 3)).T, pose[:3, :3])
+
+
+def test_without_the_pose_the_image_is_not_placed(path: Path) -> None:
+    rows = logged(path, (estimate(0), frame(0), None), frame_name="world")
+    assert "/camera" not in rows
+    assert "/camera/image" in rows
+
+
+def test_rerun_finds_nothing_wrong_with_the_file(path: Path) -> None:
+    logged(path, *((estimate(index), frame(index), cloud(index)) for index in range(10)))
+    done = subprocess.run(
+        [sys.executable, "-m", "rerun_cli", "rrd", "verify", path], capture_output=True, text=True, check=False
+    )
+    assert "verified without error" in done.stdout + done.stderr
+
+
+def test_without_a_screen_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(OutputError, match=r"no screen for the viewer: .*--out run\.rrd"):
+        LiveViewer()
+
+
+def test_a_screen_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DISPLAY", ":987")
+    with pytest.raises(OutputError, match=r"did not start \(.*: write the pictures to a file") as raised:
+        LiveViewer()
+    assert "\n" not in str(raised.value)
+
+
+@pytest.fixture
+def viewer() -> Iterator[LiveViewer]:
+    try:
+        viewer = LiveViewer(arguments=("--headless",))
+    except OutputError as error:
+        pytest.skip(f"no software renderer here: {error}")
+    yield viewer
+    viewer.close(keep_window=False)
+
+
+def listening(port: int) -> set[str]:
+    """The local addresses, as the kernel writes them, on which something listens at a port."""
+    found = set()
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        for line in Path(table).read_text().splitlines()[1:]:
+            _, local, _, state, *_ = line.split()
+            address, local_port = local.split(":")
+            if state == "0A" and int(local_port, 16) == port:
+                found.add(address)
+    return found
+
+
+def test_the_viewer_never_slows_the_tracker(viewer: LiveViewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = []
+
+    def slow(index: int, *_: Any) -> None:
+        time.sleep(0.1)
+        shown.append(index)
+
+    monkeypatch.setattr(viewer._log, "log", slow)
+    started = time.monotonic()
+    for index in range(50):
+        viewer.write(index, estimate(index))
+        time.sleep(0.01)
+    assert time.monotonic() - started < 0.9
+    assert viewer.running
+    viewer.close(keep_window=False)
+    viewer.close(keep_window=False)
+    assert shown[0] == 0
+    assert shown[-1] == 49
+    assert shown == sorted(shown)
+    assert len(shown) + viewer.skipped == 50
+    assert not viewer.running
+
+
+def test_the_viewer_listens_to_this_machine_only(viewer: LiveViewer) -> None:
+    assert listening(viewer.port) == {"0100007F"}
+
+
+def test_closing_the_window_does_not_stop_the_run(viewer: LiveViewer) -> None:
+    viewer.write(0, estimate(0), frame(0), cloud(0))
+    live._stop_app(viewer._app)
+    for index in range(1, 20):
+        viewer.write(index, estimate(index), frame(index), cloud(index))
+        time.sleep(0.005)
+    assert not viewer.running
+    assert viewer.skipped > 10
+
+
+def test_a_picture_that_fails_is_told_once(viewer: LiveViewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = []
+    monkeypatch.setattr(warnings, "warn", lambda message, *_, **__: told.append(message))
+
+    def fail(index: int, *_: Any) -> None:
+        raise ValueError("no picture")
+
+    monkeypatch.setattr(viewer._log, "log", fail)
+    for index in range(5):
+        viewer.write(index, estimate(index))
+        time.sleep(0.02)
+    viewer.close(keep_window=False)
+    assert told == ["the viewer misses frames: no picture"]
+    assert viewer.skipped == 5
