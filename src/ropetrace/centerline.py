@@ -16,6 +16,9 @@ from ropetrace.types import FloatArray, Waypoints
 _FINE_STEPS = 8
 """Pieces into which each span of the spline is divided to measure its length."""
 
+MOST_SPACINGS = 100_000
+"""More waypoints than these are not made: such a length is a wrong unit, and must not exhaust the memory."""
+
 _STEEP = 0.2
 """Sine of the angle between rope and view below which equation 16 is too ill-conditioned to be used."""
 
@@ -68,7 +71,7 @@ def sample_spline(chain: FloatArray, spacing: float) -> tuple[FloatArray, FloatA
         M >= 2, neighbours distinct, metres.
     spacing : float
         Wanted arc length between samples, metres; the nearest that divides the length evenly is used, so that the
-        last sample is the last node.
+        last sample is the last node. No more than `MOST_SPACINGS` are made.
 
     Returns
     -------
@@ -204,7 +207,7 @@ def _sample_spline(chain: Any, spacing: float) -> Any:
         before[:] = here
 
     total = length[-1]
-    samples = max(int(np.round(total / spacing)), 1) + 1
+    samples = int(min(max(np.round(total / spacing), 1.0), MOST_SPACINGS)) + 1
     positions, tangents, arc_length = np.empty((samples, 3)), np.empty((samples, 3)), np.empty(samples)
     piece = 0
     for index in range(samples):

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import math
 import re
 import tomllib
 import types
 import typing
 from dataclasses import dataclass, field
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -84,7 +86,15 @@ def _require(condition: bool, message: str) -> None:
 
 
 def _finite(*values: float) -> bool:
-    return all(isinstance(value, (int, float)) and math.isfinite(value) for value in values)
+    """Whether all are real numbers, NumPy's among them, that a double can hold."""
+    return all(isinstance(value, Real) and math.isfinite(_as_float(value)) for value in values)
+
+
+def _as_float(value: float) -> float:
+    try:
+        return float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        return math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,9 +246,10 @@ class RopeConfig:
 
     def __post_init__(self) -> None:
         low, high = DIAMETER_RANGE
+        shown = f"{self.diameter:g} m" if _finite(self.diameter) else repr(self.diameter)
         _require(
             _finite(self.diameter) and low <= self.diameter <= high,
-            f"diameter = {self.diameter:g} m: expected {low * 1e3:g} mm to {high * 1e3:g} mm "
+            f"diameter = {shown}: expected {low * 1e3:g} mm to {high * 1e3:g} mm "
             "(a number without a unit is in metres)",
         )
         if self.color is not None:
@@ -313,7 +324,7 @@ class RopeConfig:
             table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
         except OSError as error:
             raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: not a TOML file: {error}") from None
         table |= {name: value for name, value in overrides.items() if value is not None}
         try:
@@ -358,11 +369,11 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
-    if isinstance(value, tuple):
+        # JSON escapes as TOML does, but for this one character.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, (tuple, list)):
         return "[" + ", ".join(_toml_value(item) for item in value) + "]"
-    return repr(value)
+    return repr(int(value) if isinstance(value, Integral) else float(value))
 
 
 def _from_table(cls: type[Any], table: dict[str, Any], where: str) -> Any:
@@ -428,7 +439,7 @@ def _converted(value: Any, hint: Any, is_length: bool, name: str) -> Any:
         if option is int and isinstance(value, int) and not isinstance(value, bool):
             return value
         if option is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-            return float(value)
+            return _as_float(value)
         if option is float and is_length and isinstance(value, str):
             return parse_length(value)
         if option is str and isinstance(value, str):

@@ -31,6 +31,9 @@ _TOUCH = 0.2
 _LONGEST_MOVE = 3
 """Nodes that the search moves together."""
 
+_MOST_PIECES = 8
+"""Pieces that the chain is cut into at once: the time grows with 4^n."""
+
 Indices = NDArray[np.int64]
 
 
@@ -74,8 +77,9 @@ def order_path(graph: NodeGraph) -> Indices:
     """The open chain of least cost through all nodes.
 
     To the costs of the edges comes `TURN_COST` (1 - cos t)^2 for a turn by t. The search starts from the cheapest
-    edges, as Kruskal's algorithm picks them, and exchanges edges and moves nodes (2-opt and or-opt) until nothing is
-    gained.
+    edges, as Kruskal's algorithm picks them. Then, until nothing is gained, the chain is cut at its worst joints and
+    the pieces are put together in the best of all orders (Held and Karp's dynamic programme), stretches are turned
+    round (2-opt) and single nodes moved (or-opt).
 
     Returns
     -------
@@ -305,8 +309,71 @@ def _string(costs: Any, directions: Any, nodes: Any, count: int) -> float:
 @njit(cache=True, nogil=True)
 def _improve(costs: Any, directions: Any, path: Any) -> None:
     for _ in range(4 * len(path)):
-        if not (_exchange(costs, directions, path) or _move(costs, directions, path)):
+        if not (
+            _reassemble(costs, directions, path) or _exchange(costs, directions, path) or _move(costs, directions, path)
+        ):
             break
+
+
+@njit(cache=True, nogil=True)
+def _reassemble(costs: Any, directions: Any, path: Any) -> bool:
+    """Cut the chain at its worst joints and put the pieces together in the best order; False if it was that already."""
+    count = len(path)
+    joints = np.zeros(count)
+    for at in range(1, count):
+        joints[at] = _joint(costs, directions, _at(path, at - 2), path[at - 1], path[at], _at(path, at + 1))
+    cuts = np.argsort(-joints)[: _MOST_PIECES - 1]
+    cuts = np.sort(cuts[joints[cuts] >= _EASY])
+    if len(cuts) == 0:
+        return False
+    starts = np.concatenate((np.zeros(1, np.int64), cuts))
+    stops = np.concatenate((cuts, np.full(1, count)))
+    pieces = len(starts)
+
+    # A piece and its direction are one number, 2 * piece + (1 if it runs backwards).
+    turned = 2 * pieces
+    link = np.empty((turned, turned))
+    now = 0.0
+    for a in range(turned):
+        first_a, last_a = starts[a // 2], stops[a // 2] - 1
+        tail = path[last_a] if a % 2 == 0 else path[first_a]
+        before = -1 if first_a == last_a else (path[last_a - 1] if a % 2 == 0 else path[first_a + 1])
+        for b in range(turned):
+            first_b, last_b = starts[b // 2], stops[b // 2] - 1
+            head = path[first_b] if b % 2 == 0 else path[last_b]
+            after = -1 if first_b == last_b else (path[first_b + 1] if b % 2 == 0 else path[last_b - 1])
+            link[a, b] = _joint(costs, directions, before, tail, head, after)
+    for piece in range(pieces - 1):
+        now += link[2 * piece, 2 * piece + 2]
+
+    best = np.full((1 << pieces, turned), np.inf)
+    came = np.full((1 << pieces, turned), -1, np.int64)
+    for a in range(turned):
+        best[1 << (a // 2), a] = 0.0
+    for used in range(1, 1 << pieces):
+        for a in range(turned):
+            if best[used, a] == np.inf:
+                continue
+            for b in range(turned):
+                if used & (1 << (b // 2)):
+                    continue
+                cost = best[used, a] + link[a, b]
+                more = used | (1 << (b // 2))
+                if cost < best[more, b]:
+                    best[more, b] = cost
+                    came[more, b] = a
+    used = (1 << pieces) - 1
+    last = int(np.argmin(best[used]))
+    if best[used, last] > now - 1e-9:
+        return False
+    old = path.copy()
+    at = count
+    while last >= 0:
+        piece = old[starts[last // 2] : stops[last // 2]]
+        at -= len(piece)
+        path[at : at + len(piece)] = piece if last % 2 == 0 else piece[::-1]
+        last, used = came[used, last], used & ~(1 << (last // 2))
+    return True
 
 
 @njit(cache=True, nogil=True)

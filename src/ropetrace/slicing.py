@@ -21,6 +21,19 @@ _TIE = 1e-7
 _EQUAL = 1e-6
 """Relative difference below which two eigenvalues, or a skewness and zero, are taken to be equal."""
 
+_STEEP_NORMAL, _LARGE_COORDINATE = 0.78693, 0.10371
+"""Limits of direction cosines that the directions of grids do not meet: (4, 0, 3) / 5 would meet 0.8."""
+
+
+_RIM = 0.95
+"""Part of the radius beyond which the round profile is too steep to say anything."""
+
+_WIDE = 1.5
+"""A slice whose variance across the rope exceeds that of a tube of its diameter this much is no single tube."""
+
+_FEWEST_FOR_FIT = 8
+"""Points that a slice must have for its profile to be fitted."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slices:
@@ -115,27 +128,31 @@ class Slicer:
 
 
 def axis_points(
-    centroids: FloatArray,
-    covariances: FloatArray,
+    points: FloatArray,
+    slices: Slices,
     tangents: FloatArray,
     radius: float,
     surface_offset: tuple[float, float, float] | None = None,
 ) -> FloatArray:
     """Points on the rope's axis below the centroids of ordered slices of its visible surface (equation 11).
 
-    Two things keep a centroid off the axis. The mean of a bent slice lies inside the bend: for a slice whose points
-    have the variance s^2 along the rope, by s^2/2 times the curve's second derivative, which is taken back. And the
-    camera sees the near side only: the centroid moves away from the camera, across the rope, by the mean depth of the
-    visible surface before the axis. For a cylinder of radius r seen to a half-width of w that is
-    (sqrt(r^2 - w^2) + r^2/w asin(w/r)) / 2, which is r pi/4 where all of it is seen (w = r); w follows from the
-    slice's variance across the rope, w^2/3, so that lost edges and coarse pixels do not bias it.
+    Three things keep a centroid off the axis, and are taken back:
+
+    - The mean of a bent slice lies inside the bend: for a slice whose points have the variance s^2 along the rope, by
+      s^2/2 times the curve's second derivative.
+    - The camera sees the near side only. A point seen at u to the side of the axis of a cylinder of radius r lies
+      sqrt(r^2 - u^2) before it, r pi/4 in the mean; the slice's own points say how they are spread, so that lost edges
+      and coarse pixels do not bias it.
+    - Pixels seldom fall alike on both edges, so the centroid may lie up to half a pixel to the side. The round profile
+      of the surface says where its middle is: the sideways shift that makes the points agree best on the axis' depth
+      is taken as far as their scatter allows, against the quarter of a pixel that the pixels leave open.
 
     Parameters
     ----------
-    centroids : (M, 3) float array
-        In order along the rope, M >= 2, metres, camera frame.
-    covariances : (M, 3, 3) float array
-        Of the slices' points, m^2.
+    points : (3, N) float array
+        As `Slicer.slice` sorted them, metres, camera frame.
+    slices : Slices
+        In order along the rope, M >= 2.
     tangents : (M, 3) float array
         Unit vectors along the rope.
     radius : float
@@ -148,17 +165,35 @@ def axis_points(
     (M, 3) float array
     """
     if surface_offset is not None:
-        return centroids + np.array(surface_offset)
-    nodes = np.empty_like(centroids)
-    _axis_points(centroids, covariances, tangents, radius, nodes)
+        return slices.centroids + np.array(surface_offset)
+    nodes = np.empty_like(slices.centroids)
+    _axis_points(
+        (points[0], points[1], points[2]),
+        slices.starts,
+        slices.counts,
+        slices.centroids,
+        slices.covariances,
+        tangents,
+        radius,
+        nodes,
+    )
     return nodes
 
 
 @njit(cache=True, nogil=True)
-def _axis_points(centroids: Any, covariances: Any, tangents: Any, radius: float, nodes: Any) -> None:
-    count = len(centroids)
-    away = np.empty(3)
-    for m in range(count):
+def _axis_points(
+    points: Any,
+    starts: Any,
+    counts: Any,
+    centroids: Any,
+    covariances: Any,
+    tangents: Any,
+    radius: float,
+    nodes: Any,
+) -> None:
+    last = len(centroids) - 1
+    away, side, bend = np.empty(3), np.empty(3), np.empty(3)
+    for m in range(last + 1):
         c, t = centroids[m], tangents[m]
         size = np.sqrt(c[0] * c[0] + c[1] * c[1] + c[2] * c[2])
         slope = (c[0] * t[0] + c[1] * t[1] + c[2] * t[2]) / max(size, 1e-9)
@@ -166,24 +201,95 @@ def _axis_points(centroids: Any, covariances: Any, tangents: Any, radius: float,
             away[k] = c[k] / max(size, 1e-9) - slope * t[k]
         # Where the rope points at the camera it has no visible half to correct for: fade out.
         sine = max(np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2), 0.1)
-        for k in range(3):
-            away[k] /= sine
-        sx, sy, sz = t[1] * away[2] - t[2] * away[1], t[2] * away[0] - t[0] * away[2], t[0] * away[1] - t[1] * away[0]
-        v = covariances[m]
-        across = sx * sx * v[0, 0] + sy * sy * v[1, 1] + sz * sz * v[2, 2]
-        across += 2 * (sx * sy * v[0, 1] + sx * sz * v[0, 2] + sy * sz * v[1, 2])
-        along = t[0] * t[0] * v[0, 0] + t[1] * t[1] * v[1, 1] + t[2] * t[2] * v[2, 2]
-        along += 2 * (t[0] * t[1] * v[0, 1] + t[0] * t[2] * v[0, 2] + t[1] * t[2] * v[1, 2])
-        seen = min(np.sqrt(max(3 * across, 0.0)) / radius, 1.0)
-        depth = radius * (0.5 * (np.sqrt(1 - seen * seen) + np.arcsin(seen) / seen) if seen > 1e-3 else 1.0)
         before = after = 1.0
-        if 0 < m < count - 1:
+        if 0 < m < last:
             before, after = _distance(centroids[m - 1], c), _distance(c, centroids[m + 1])
         for k in range(3):
-            nodes[m, k] = c[k] + depth * away[k]
-            if 0 < m < count - 1:
-                bend = 2 * ((centroids[m + 1, k] - c[k]) / after - (c[k] - centroids[m - 1, k]) / before)
-                nodes[m, k] -= 0.5 * along * bend / (before + after)
+            away[k] /= sine
+            bend[k] = 0.0
+            if 0 < m < last:
+                change = (centroids[m + 1, k] - c[k]) / after - (c[k] - centroids[m - 1, k]) / before
+                bend[k] = 2 * change / (before + after)
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            side[k] = t[i] * away[j] - t[j] * away[i]
+        along, across = _variance(covariances[m], t), _variance(covariances[m], side)
+        depth, sideways = _profile(
+            points, starts[m], starts[m] + counts[m], c, t, side, away, bend, along, across, radius
+        )
+        for k in range(3):
+            nodes[m, k] = c[k] - 0.5 * along * bend[k] + depth * away[k] + sideways * side[k]
+
+
+@njit(cache=True, nogil=True)
+def _variance(covariance: Any, direction: Any) -> float:
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += direction[i] * covariance[i, j] * direction[j]
+    return max(total, 0.0)
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _profile(
+    points: Any,
+    start: int,
+    stop: int,
+    c: Any,
+    t: Any,
+    side: Any,
+    away: Any,
+    bend: Any,
+    along: float,
+    across: float,
+    radius: float,
+) -> Any:
+    """Where the axis lies from a slice's centroid: away from the camera, and to the side, metres.
+
+    With u and w a point's coordinates to the side and away, and s = sqrt(r^2 - u^2), the axis is w + s away; if it
+    lies u0 to the side, that is w + s + u0 u/s. The least-squares u0 is shrunk by the variance that it has.
+    """
+    seen = min(np.sqrt(3 * across) / radius, 1.0)
+    mean_depth = radius * (0.5 * (np.sqrt(1 - seen * seen) + np.arcsin(seen) / seen) if seen > 1e-3 else 1.0)
+    if across > _WIDE * radius * radius / 3:
+        # More than one strand, or a blob: no round profile to fit.
+        return mean_depth, 0.0
+    x, y, z = points
+    cx, cy, cz = c[0], c[1], c[2]
+    tx, ty, tz = t[0], t[1], t[2]
+    sx, sy, sz = side[0], side[1], side[2]
+    ax, ay, az = away[0], away[1], away[2]
+    bend_side = 0.5 * (bend[0] * sx + bend[1] * sy + bend[2] * sz)
+    bend_away = 0.5 * (bend[0] * ax + bend[1] * ay + bend[2] * az)
+    inside = (_RIM * radius) ** 2
+    n = sq = sg = sqg = sgg = sqq = 0.0
+    for i in range(np.uintp(start), np.uintp(stop)):
+        dx, dy, dz = x[i] - cx, y[i] - cy, z[i] - cz
+        v = tx * dx + ty * dy + tz * dz
+        curved = v * v - along
+        u = sx * dx + sy * dy + sz * dz - bend_side * curved
+        w = ax * dx + ay * dy + az * dz - bend_away * curved
+        near = 1.0 if u * u < inside else 0.0
+        s = np.sqrt(max(radius * radius - u * u, (1 - _RIM * _RIM) * radius * radius))
+        q = w + s
+        g = u / s
+        n += near
+        sq += near * q
+        sg += near * g
+        sqg += near * q * g
+        sgg += near * g * g
+        sqq += near * q * q
+    if n < _FEWEST_FOR_FIT:
+        return mean_depth, 0.0
+    vgg = sgg - sg * sg / n
+    vqg = sqg - sq * sg / n
+    vqq = sqq - sq * sq / n
+    if vgg <= 0:
+        return mean_depth, 0.0
+    scatter = max(vqq - vqg * vqg / vgg, 0.0) / (n - 2)
+    pixel = 12 * np.sqrt(along * across) / (stop - start)
+    shift = -vqg / vgg * vgg / (vgg + scatter / (pixel / 16 + 1e-18))
+    return (sq + shift * sg) / n, shift
 
 
 @njit(cache=True, nogil=True)
@@ -271,12 +377,12 @@ def _first_axis(m: Any, axis: Any) -> float:
         axis[0], axis[1], axis[2] = 1.0, 0.0, 0.0
     elif a[middle, middle] > (1 - _EQUAL) * a[first, first]:
         # Any direction in the plane of the two will do: the one closest to a fixed coordinate axis is always the same.
-        fixed = 0 if abs(v[0, last]) < 0.8 else 1
+        fixed = 0 if abs(v[0, last]) < _STEEP_NORMAL else 1
         size = np.sqrt(1 - v[fixed, last] ** 2)
         for k in range(3):
             axis[k] = ((1.0 if k == fixed else 0.0) - v[fixed, last] * v[k, last]) / size
     for k in range(3):
-        if abs(axis[k]) > 0.1:
+        if abs(axis[k]) > _LARGE_COORDINATE:
             if axis[k] < 0:
                 for j in range(3):
                     axis[j] = -axis[j]

@@ -180,9 +180,7 @@ class StampStatistics:
         """Seconds from the earliest stamp to the latest; None with fewer than two."""
         return (self._span[1] - self._span[0]) / 1e9 if self._span and self.count > 1 else None
 
-    def stream(
-        self, name: str, encoding: str, width: int | None = None, height: int | None = None
-    ) -> StreamInfo:
+    def stream(self, name: str, encoding: str, width: int | None = None, height: int | None = None) -> StreamInfo:
         """The row of `RecordingInfo` for this stream."""
         rate = self._rising_steps / (self._rising_ns / 1e9) if self._rising_ns else None
         gap = self._largest_ns / 1e9 if self._largest_ns is not None else None
@@ -266,9 +264,7 @@ def read_camera(path: Path) -> tuple[Intrinsics, float]:
     """
     wanted = f"a JSON object with {', '.join(CAMERA_KEYS)} (pixels; metres in one unit of depth)"
     if not os.path.lexists(path):
-        raise RecordingError(
-            f"{path}: there is no such file, and depth is useless without its camera: write {wanted}"
-        )
+        raise RecordingError(f"{path}: there is no such file, and depth is useless without its camera: write {wanted}")
     try:
         table: Any = json.loads(read_file(path, 2**20).decode())
     except FrameError as error:

@@ -173,9 +173,7 @@ def _npz(data: bytes) -> Cloud:
         names = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
         for entry in names.values():
             if entry.file_size > MAX_FILE_BYTES:
-                raise FrameError(
-                    f"{entry.filename} declares {entry.file_size} bytes: {MAX_FILE_BYTES} are taken"
-                )
+                raise FrameError(f"{entry.filename} declares {entry.file_size} bytes: {MAX_FILE_BYTES} are taken")
         # Reading stops at the declared size, and checks the CRC there.
         if "points" in names:
             points = _points(_array(archive.read(names["points"])))
@@ -193,9 +191,7 @@ def _ply(data: bytes) -> Cloud:
     if "vertices" not in loaded:
         return np.empty((0, 3), np.float32), None
     colors = loaded.get("vertex_colors")
-    return _points(np.asarray(loaded["vertices"])), None if colors is None else _colors(
-        np.asarray(colors)[:, :3]
-    )
+    return _points(np.asarray(loaded["vertices"])), None if colors is None else _colors(np.asarray(colors)[:, :3])
 
 
 def _check_ply(data: bytes) -> None:
@@ -216,9 +212,7 @@ def _check_ply(data: bytes) -> None:
             count = int(words[2])
         elif words[:1] == ["property"]:
             # A list is at least its count; a number in text is at least a digit and a space.
-            kind = (
-                words[2] if words[1:2] == ["list"] and len(words) > 2 else words[1] if len(words) > 1 else ""
-            )
+            kind = words[2] if words[1:2] == ["list"] and len(words) > 2 else words[1] if len(words) > 1 else ""
             if kind not in _PLY_BYTES or is_ascii is None:
                 raise FrameError(f"impossible PLY header line {line!r}")
             left -= count * (2 if is_ascii else _PLY_BYTES[kind])
@@ -257,30 +251,19 @@ def _check_pcd(data: bytes) -> None:
     header.setdefault("COUNT", ["1"] * len(header.get("FIELDS", [])))
     for key in ("SIZE", "COUNT", "WIDTH", "HEIGHT", "POINTS"):
         if not header.get(key) or not all(re.fullmatch(r"[0-9]{1,18}", word) for word in header[key]):
-            raise FrameError(
-                f"impossible PCD header line {key} {' '.join(header.get(key, ['(missing)']))[:80]}"
-            )
+            raise FrameError(f"impossible PCD header line {key} {' '.join(header.get(key, ['(missing)']))[:80]}")
         numbers[key] = [int(word) for word in header[key]]
     fields = len(header.get("FIELDS", []))
-    if not fields or not fields == len(numbers["SIZE"]) == len(numbers["COUNT"]) == len(
-        header.get("TYPE", [])
-    ):
+    if not fields or not fields == len(numbers["SIZE"]) == len(numbers["COUNT"]) == len(header.get("TYPE", [])):
         raise FrameError("the PCD header's FIELDS, SIZE, TYPE and COUNT are not of one length")
     points = numbers["POINTS"][0]
     row = sum(size * count for size, count in zip(numbers["SIZE"], numbers["COUNT"], strict=True))
     left, method = len(data) - match.end(), match[1]
-    if (
-        points != numbers["WIDTH"][0] * numbers["HEIGHT"][0]
-        or max(*numbers["COUNT"], sum(numbers["COUNT"])) > 4096
-    ):
+    if points != numbers["WIDTH"][0] * numbers["HEIGHT"][0] or max(*numbers["COUNT"], sum(numbers["COUNT"])) > 4096:
         raise FrameError(f"the PCD header declares {points} points, which does not fit the rest of it")
     if method == b"binary_compressed":
         packed, unpacked = struct.unpack_from("<II", data, match.end()) if left >= 8 else (0, 0)
-        fits = (
-            packed <= left - 8
-            and unpacked == points * row
-            and unpacked <= min(packed * _LZF_RATIO, MAX_FILE_BYTES)
-        )
+        fits = packed <= left - 8 and unpacked == points * row and unpacked <= min(packed * _LZF_RATIO, MAX_FILE_BYTES)
     else:
         fits = points * row <= left if method == b"binary" else points * 2 * sum(numbers["COUNT"]) <= left + 2
     if points > MAX_IMAGE_PIXELS or not fits:
@@ -290,9 +273,7 @@ def _check_pcd(data: bytes) -> None:
 def _points(array: NDArray[Any]) -> NDArray[Any]:
     """An (N, 3) float array that this machine computes with."""
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
-        raise FrameError(
-            f"an array of {array.dtype} of shape {array.shape}; points must be numbers of shape (N, 3)"
-        )
+        raise FrameError(f"an array of {array.dtype} of shape {array.shape}; points must be numbers of shape (N, 3)")
     if len(array) > MAX_IMAGE_PIXELS:
         raise FrameError(f"{len(array)} points: {MAX_IMAGE_PIXELS} are taken at most")
     small = array.dtype.kind == "f" and array.dtype.itemsize <= 4
@@ -302,9 +283,7 @@ def _points(array: NDArray[Any]) -> NDArray[Any]:
 def _colors(array: NDArray[Any]) -> NDArray[np.uint8]:
     """(N, 3) colours of 0 to 255, or of 0 to 1 where they are floats and none is larger."""
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
-        raise FrameError(
-            f"colours are {array.dtype} of shape {array.shape}: expected (N, 3) numbers of 0 to 255"
-        )
+        raise FrameError(f"colours are {array.dtype} of shape {array.shape}: expected (N, 3) numbers of 0 to 255")
     if array.dtype == np.uint8:
         return np.array(array, order="C")
     values = np.nan_to_num(array.astype(np.float64), nan=0.0)

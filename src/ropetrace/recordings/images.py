@@ -92,20 +92,14 @@ def _checked_pixels(header: PngHeader, chunks: list[tuple[bytes, bytes]]) -> byt
     except zlib.error as error:
         raise FrameError(f"the PNG is damaged: {error}") from None
     if found != expected or not inflate.eof:
-        raise FrameError(
-            f"the PNG is damaged: its pixels are not the {expected} bytes that its header declares"
-        )
+        raise FrameError(f"the PNG is damaged: its pixels are not the {expected} bytes that its header declares")
     return PNG_SIGNATURE + b"".join(chunk for _, chunk in chunks)
 
 
 def _png_header(payload: bytes) -> PngHeader:
-    width, height, bit_depth, color_type, compression, filtering, interlace = struct.unpack(
-        ">IIBBBBB", payload
-    )
+    width, height, bit_depth, color_type, compression, filtering, interlace = struct.unpack(">IIBBBBB", payload)
     if not width or not height or width * height > MAX_IMAGE_PIXELS:
-        raise FrameError(
-            f"the PNG declares {width}x{height}: 1 to {MAX_IMAGE_PIXELS} pixels in all are taken"
-        )
+        raise FrameError(f"the PNG declares {width}x{height}: 1 to {MAX_IMAGE_PIXELS} pixels in all are taken")
     if bit_depth not in _BIT_DEPTHS.get(color_type, ()) or compression or filtering:
         raise FrameError(f"the PNG declares an unknown format (colour type {color_type}, {bit_depth} bits)")
     if interlace:
@@ -128,9 +122,7 @@ def decode_depth(data: bytes) -> NDArray[np.uint16]:
     """
     header, chunks = _pixel_chunks(data)
     if header.color_type != 0:
-        raise FrameError(
-            f"{_CHANNELS[header.color_type]}-channel or palette PNG; depth needs 16-bit grey PNG"
-        )
+        raise FrameError(f"{_CHANNELS[header.color_type]}-channel or palette PNG; depth needs 16-bit grey PNG")
     if header.bit_depth != 16:
         raise FrameError(f"{header.bit_depth}-bit; depth needs 16-bit PNG")
     depth = _decoded(_checked_pixels(header, chunks), "PNG")

@@ -103,9 +103,7 @@ class McapFrameWriter:
         stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
         return types["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME_ID)
 
-    def _write_image(
-        self, topic: str, header: Any, stamp_ns: int, pixels: NDArray[Any], encoding: str
-    ) -> None:
+    def _write_image(self, topic: str, header: Any, stamp_ns: int, pixels: NDArray[Any], encoding: str) -> None:
         stored = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("<"))
         image = self._messages.types[IMAGE](
             header=header,
@@ -123,9 +121,7 @@ class McapFrameWriter:
     def _camera(self, header: Any) -> Any:
         camera = self.intrinsics
         types = self._messages.types
-        region = types["sensor_msgs/msg/RegionOfInterest"](
-            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
+        region = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         k = [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
         p = [camera.fx, 0, camera.cx, 0, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0]
         return types[CAMERA](

@@ -77,9 +77,7 @@ class McapFile:
             for identity, count in self._summary.statistics.channel_message_counts.items():
                 if identity in self._summary.known.channels:
                     counts[self._summary.known.channels[identity][0]] += count
-            return {
-                topic: Topic(kind, counts[topic]) for topic, kind, _ in self._summary.known.channels.values()
-            }
+            return {topic: Topic(kind, counts[topic]) for topic, kind, _ in self._summary.known.channels.values()}
         current = _Pass(wanted=())
         for _ in self._walk(current):
             pass
@@ -149,9 +147,7 @@ class McapFile:
                 try:
                     current.known.take(opcode, payload)
                 except DamageError as damage:
-                    note(
-                        self.problems, f"an unreadable record at byte {offset} ({damage.reason}) is left out"
-                    )
+                    note(self.problems, f"an unreadable record at byte {offset} ({damage.reason}) is left out")
             elif opcode == Opcode.MESSAGE:
                 current.unprotected += 1
                 yield from self._message(payload, offset, current)
@@ -240,9 +236,7 @@ class McapFile:
         if current.unprotected:
             self.checksums = "one CRC over all of the file" if crc else "none: altered bits may go unnoticed"
         else:
-            self.checksums = (
-                "a CRC over each chunk, and one over the file" if crc else "a CRC over each chunk"
-            )
+            self.checksums = "a CRC over each chunk, and one over the file" if crc else "a CRC over each chunk"
         if not crc or current.data_crc in (None, crc):
             return
         if current.unprotected:
@@ -261,9 +255,7 @@ class McapFile:
     def _conclude(self, current: _Pass) -> None:
         """State the loss."""
         found = sum(current.seen.values())
-        expected = (
-            self._summary.statistics.message_count if self._summary and self._summary.statistics else None
-        )
+        expected = self._summary.statistics.message_count if self._summary and self._summary.statistics else None
         if expected is not None and expected != found:
             note(self.problems, f"{found} of the {expected} messages of the file were recovered")
         elif expected is None and not current.lossless:

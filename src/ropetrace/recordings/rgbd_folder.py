@@ -90,9 +90,7 @@ class RgbdFolder:
         self._max_gap_ns = round(max_pair_gap * 1e9)
         self._depth = _read_rows(path, "depth.txt", self.problems)
         if not self._depth:
-            raise RecordingError(
-                f"{path / 'depth.txt'}: lists no image; write a line 'seconds path' for each"
-            )
+            raise RecordingError(f"{path / 'depth.txt'}: lists no image; write a line 'seconds path' for each")
         has_color = os.path.lexists(path / "rgb.txt")
         rows = _read_rows(path, "rgb.txt", self.problems) if has_color else []
         self._color = sorted(rows, key=lambda row: row.stamp_ns) if has_color else None
@@ -140,9 +138,7 @@ class RgbdFolder:
                 statistics.add(row.stamp_ns)
             note_bad_images(self.path, [row.file for row in rows], name, self.problems)
             if rows:
-                streams.append(
-                    statistics.stream(name, encoding, self.intrinsics.width, self.intrinsics.height)
-                )
+                streams.append(statistics.stream(name, encoding, self.intrinsics.width, self.intrinsics.height))
             duration = statistics.duration if name == "depth" else duration
         checksums = "every PNG chunk has a CRC; JPEG has none"
         return RecordingInfo(
@@ -169,9 +165,7 @@ def _read_rows(folder: Path, name: str, problems: list[str]) -> list[_Row]:
     try:
         text = read_file(folder / name, MAX_TEXT_BYTES).decode(errors="replace")
     except FrameError as error:
-        raise RecordingError(
-            f"{folder}: {error}; it must list the images, a line 'seconds path' each"
-        ) from None
+        raise RecordingError(f"{folder}: {error}; it must list the images, a line 'seconds path' each") from None
     rows: list[_Row] = []
     unreadable: list[int] = []
     inside: dict[str, bool] = {}
@@ -266,9 +260,7 @@ class RgbdFolderWriter:
             If the frame's camera, unit or type of depth is not the folder's, or the disk refuses.
         """
         if frame.depth.dtype != np.uint16:
-            raise OutputError(
-                f"{self.path}: depth is {frame.depth.dtype}; PNG holds uint16 only: write MCAP instead"
-            )
+            raise OutputError(f"{self.path}: depth is {frame.depth.dtype}; PNG holds uint16 only: write MCAP instead")
         if frame.intrinsics != self.intrinsics or frame.depth_unit_m != self.depth_unit_m:
             raise OutputError(f"{self.path}: the frame's camera or depth unit is not the recording's")
         try:

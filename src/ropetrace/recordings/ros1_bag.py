@@ -162,9 +162,7 @@ class Ros1Bag:
             current.lossless = False
             note(self.problems, f"reading stopped: {error.strerror}")
         found = sum(current.seen.values())
-        expected = (
-            sum(topic.count or 0 for topic in self._counts.values()) if self._counts is not None else None
-        )
+        expected = sum(topic.count or 0 for topic in self._counts.values()) if self._counts is not None else None
         if expected is not None and expected != found:
             note(self.problems, f"{found} of the {expected} messages of the file were recovered")
         elif expected is None and not current.lossless:
@@ -202,9 +200,7 @@ class Ros1Bag:
             _connect(current, record)
             if any(current.connections[identity] != known for identity, known in before.items()):
                 current.connections = before
-                note(
-                    self.problems, f"the index and the chunk at byte {offset} disagree on a topic or its type"
-                )
+                note(self.problems, f"the index and the chunk at byte {offset} disagree on a topic or its type")
             return
         if record.kind != _MESSAGE:
             raise DamageError(record.offset, f"a record of type {record.kind} is among the messages")

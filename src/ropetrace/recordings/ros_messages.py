@@ -117,9 +117,7 @@ def stamp_and_frame(message: RawMessage) -> tuple[int, str]:
             seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
             text = bytes(data[16 : 16 + length]).rstrip(b"\0")
         else:
-            raise FrameError(
-                f"{message.topic}: messages encoded as {message.encoding!r}: only cdr and ros1 are read"
-            )
+            raise FrameError(f"{message.topic}: messages encoded as {message.encoding!r}: only cdr and ros1 are read")
     except (struct.error, IndexError):
         raise FrameError(f"{message.topic}: a message of {len(data)} bytes has no whole header") from None
     return seconds * 10**9 + nanoseconds, text.decode(errors="replace")
@@ -164,9 +162,7 @@ def depth_image(message: RawMessage) -> tuple[NDArray[Any], float]:
     else:
         kind = DEPTH_ENCODINGS.get(body.encoding)
         if kind is None:
-            raise FrameError(
-                f"encoding {body.encoding!r} is not depth: expected {', '.join(DEPTH_ENCODINGS)}"
-            )
+            raise FrameError(f"encoding {body.encoding!r} is not depth: expected {', '.join(DEPTH_ENCODINGS)}")
         depth = _pixels(body, np.dtype(kind), 1)[:, :, 0]
     return depth, 0.001 if depth.dtype == np.uint16 else 1.0
 
@@ -193,9 +189,7 @@ def _pixels(image: Any, kind: np.dtype[Any], channels: int) -> NDArray[Any]:
     """The (H, W, channels) pixels of an Image: a copy, in this machine's byte order."""
     width, height, step = image.width, image.height, image.step
     if not width or not height or width * height > MAX_IMAGE_PIXELS:
-        raise FrameError(
-            f"the image declares {width}x{height}: 1 to {MAX_IMAGE_PIXELS} pixels in all are taken"
-        )
+        raise FrameError(f"the image declares {width}x{height}: 1 to {MAX_IMAGE_PIXELS} pixels in all are taken")
     used = width * channels * kind.itemsize
     if step < used or step * height != len(image.data):
         raise FrameError(
@@ -212,16 +206,12 @@ def _compressed_depth(data: bytes, declared: str) -> NDArray[Any]:
     has_header = not data.startswith(images.PNG_SIGNATURE)
     if has_header and not data[12:].startswith(images.PNG_SIGNATURE):
         what = "JPEG, which destroys depth" if data.startswith(images.JPEG_SIGNATURE) else "not PNG"
-        raise FrameError(
-            f"compressed depth (format {declared!r}) is {what}: record it raw or as compressedDepth png"
-        )
+        raise FrameError(f"compressed depth (format {declared!r}) is {what}: record it raw or as compressedDepth png")
     depth = images.decode_depth(data[12:] if has_header else data)
     if not declared.startswith("32FC1"):
         return depth
     if not has_header:
-        raise FrameError(
-            f"compressed depth of format {declared!r} has no compressedDepth header: no unit is known"
-        )
+        raise FrameError(f"compressed depth of format {declared!r} has no compressedDepth header: no unit is known")
     # The transport stores metres as quantised inverse depth, value = a / depth + b.
     _, a, b = struct.unpack_from("<iff", data)
     if not (math.isfinite(a) and math.isfinite(b) and a > 0):
@@ -297,12 +287,8 @@ def cloud(message: RawMessage) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
             fields[field.name] = (kind, field.offset)
     if any(fields.get(name, ("",))[0] not in ("f4", "f8") for name in "xyz"):
         found = ", ".join(repr(field.name) for field in body.fields[:16])
-        raise FrameError(
-            f"the cloud needs fields x, y, z of float32 or float64 within a point; found: {found}"
-        )
-    rows = np.frombuffer(body.data, np.uint8).reshape(body.height, body.row_step)[
-        :, : body.width * point_step
-    ]
+        raise FrameError(f"the cloud needs fields x, y, z of float32 or float64 within a point; found: {found}")
+    rows = np.frombuffer(body.data, np.uint8).reshape(body.height, body.row_step)[:, : body.width * point_step]
     raw = np.ascontiguousarray(rows).reshape(count, point_step)
 
     def column(kind: str, offset: int) -> NDArray[Any]:

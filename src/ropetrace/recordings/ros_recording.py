@@ -51,9 +51,7 @@ class RosRecording:
         self._topics = source.topics()
         if not self._topics:
             damage = "; ".join(source.problems[:2])
-            raise RecordingError(
-                f"{self.path}: a {self.kind} without any readable message{damage and ': ' + damage}"
-            )
+            raise RecordingError(f"{self.path}: a {self.kind} without any readable message{damage and ': ' + damage}")
         self._first = self._first_messages()
         self._choice = choose_topics(
             str(self.path),
@@ -82,9 +80,7 @@ class RosRecording:
     def _first_messages(self) -> dict[str, RawMessage]:
         """The first message of every topic of images and cameras."""
         missing = {
-            name
-            for name, row in self._topics.items()
-            if row.type in (IMAGE, COMPRESSED, CAMERA) and row.count != 0
+            name for name, row in self._topics.items() if row.type in (IMAGE, COMPRESSED, CAMERA) and row.count != 0
         }
         found: dict[str, RawMessage] = {}
         for message in self._source.messages(missing.copy()) if missing else ():
@@ -103,9 +99,7 @@ class RosRecording:
         assert choice.depth is not None
         if choice.depth not in self._first or choice.camera not in self._first:
             missing = choice.depth if choice.depth not in self._first else choice.camera
-            raise RecordingError(
-                f"{self.path}: no message of {missing} can be read; it holds {listed(self._topics)}"
-            )
+            raise RecordingError(f"{self.path}: no message of {missing} can be read; it holds {listed(self._topics)}")
         try:
             intrinsics = ros_messages.camera(self._first[choice.camera])
         except FrameError as error:
@@ -177,9 +171,7 @@ class RosRecording:
             return f"its camera_info is unusable: {error}"
         return None if camera == self.intrinsics else f"camera_info changed to {camera} within the recording"
 
-    def _rgbd_frame(
-        self, stamp: int, depth: RawMessage, changed: str | None, color: RawMessage | str | None
-    ) -> Event:
+    def _rgbd_frame(self, stamp: int, depth: RawMessage, changed: str | None, color: RawMessage | str | None) -> Event:
         assert self.intrinsics is not None
         try:
             if changed:

@@ -60,16 +60,12 @@ def choose_topics(
         if topic and topic not in topics:
             raise RecordingError(f"{where}: there is no topic {topic!r}; it holds {listed(topics)}")
         if topic and topics[topic].type not in kinds:
-            raise RecordingError(
-                f"{where}: the topic {topic!r} is {topics[topic].type}, expected {' or '.join(kinds)}"
-            )
+            raise RecordingError(f"{where}: the topic {topic!r} is {topics[topic].type}, expected {' or '.join(kinds)}")
     if cloud and (depth or color):
         raise RecordingError(f"{where}: give a cloud topic, or depth and colour topics, but not both")
     if cloud:
         return Choice(cloud=cloud)
-    encodings = {
-        topic: _encoding(message) for topic, message in first.items() if message.type in (IMAGE, COMPRESSED)
-    }
+    encodings = {topic: _encoding(message) for topic, message in first.items() if message.type in (IMAGE, COMPRESSED)}
     if not depth:
         found = [topic for topic in encodings if _is_depth(topic, topics[topic].type, encodings[topic])]
         clouds = [topic for topic, row in topics.items() if row.type == CLOUD and row.count != 0]

@@ -57,9 +57,7 @@ class Rosbag2Folder:
                 before = topics.get(name)
                 known = before is None or before.count is not None
                 count = (
-                    topic.count + (before.count or 0 if before else 0)
-                    if known and topic.count is not None
-                    else None
+                    topic.count + (before.count or 0 if before else 0) if known and topic.count is not None else None
                 )
                 topics[name] = Topic(topic.type, count)
         self._gather()
@@ -75,9 +73,7 @@ class Rosbag2Folder:
             self._gather()
         expected = self._expected()
         if wanted is None and expected is not None and found != expected:
-            note(
-                self.problems, f"{found} of the {expected} messages that metadata.yaml counts were recovered"
-            )
+            note(self.problems, f"{found} of the {expected} messages that metadata.yaml counts were recovered")
 
     def _expected(self) -> int | None:
         """The count of all messages in metadata.yaml, if it is there and says so."""

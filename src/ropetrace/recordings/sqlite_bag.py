@@ -140,8 +140,7 @@ class SqliteBag:
             except sqlite3.Error as error:
                 note(
                     self.problems,
-                    f"the table of messages is damaged ({one_line(error)}): "
-                    f"{len(rows)} messages before were found",
+                    f"the table of messages is damaged ({one_line(error)}): {len(rows)} messages before were found",
                 )
         table = np.array(rows, dtype=np.int64).reshape(-1, 3)
         table = table[np.argsort(table[:, 2], kind="stable")]

@@ -6,6 +6,7 @@ Rastegarpanah, Howard and Stolkin, "Tracking linear deformable objects using sli
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ropetrace.centerline import chain_tangents, extend_to_tips, make_waypoints
 from ropetrace.config import RopeConfig, SegmentationConfig, parse_color
@@ -83,9 +84,7 @@ class SlicingTracker:
             return Estimate.lost(frame.stamp_ns, "the points do not hang together", count)
 
         tangents = chain_tangents(slices.centroids)
-        nodes = axis_points(
-            slices.centroids, slices.covariances, tangents, self.config.radius, self.config.slicing.surface_offset
-        )
+        nodes = axis_points(points, slices, tangents, self.config.radius, self.config.slicing.surface_offset)
         chain = extend_to_tips(nodes, _reach(slices, tangents))
         assert self.config.centerline.spacing is not None
         waypoints = make_waypoints(chain, self.config.centerline.spacing, self._waypoints)
@@ -172,8 +171,10 @@ class SlicingTracker:
         gaps = graph.gaps[order[:-1], order[1:]]
         assert ordering.max_gap is not None
         trouble = []
-        if gaps.max() > ordering.max_gap:
-            ends = np.flatnonzero(gaps > ordering.max_gap)
+        ends = np.flatnonzero(gaps > ordering.max_gap)
+        if len(ends):
+            ends = ends[_as_seen(gaps, graph, order, slices.centroids)[ends] > ordering.max_gap]
+        if len(ends):
             pieces = np.split(order, ends + 1)
             longest = max(pieces, key=lambda piece: int(slices.counts[piece].sum()))
             trouble.append(
@@ -201,8 +202,20 @@ class SlicingTracker:
 BRIDGE_DIAMETERS = 5.0
 """A gap of more diameters than this in the chain is worth telling."""
 
+_ALONG_VIEW = 0.3
+"""How much a gap along the view counts: a rope that leads away from the camera hides its own next stretch."""
+
 _SURFACE_NEIGHBOURS = 4
 """Where the typical slice touches this many others, the points are a wall or a table, not a rope."""
+
+
+def _as_seen(gaps: FloatArray, graph: NodeGraph, order: NDArray[np.int64], centroids: FloatArray) -> FloatArray:
+    """The gaps of a chain, less what of them lies along the view, metres."""
+    directions = graph.directions[order[:-1], order[1:]]
+    views = (centroids[order[:-1]] + centroids[order[1:]]) / 2
+    views /= np.maximum(np.linalg.norm(views, axis=1, keepdims=True), 1e-9)
+    along = np.sum(directions * views, axis=1)
+    return gaps * np.sqrt(1 - (1 - _ALONG_VIEW**2) * along**2)
 
 
 def _reach(slices: Slices, tangents: FloatArray) -> tuple[float, float]:
