@@ -26,9 +26,7 @@ Sample = tuple[str, str, int, Any]
 """Topic, message type, time of recording and message."""
 
 
-def make_frames(
-    count: int, kind: type = np.uint16, color: bool = True, start_ns: int = 10**18
-) -> list[RgbdFrame]:
+def make_frames(count: int, kind: type = np.uint16, color: bool = True, start_ns: int = 10**18) -> list[RgbdFrame]:
     """Frames of noise, 8x6 pixels, 30 Hz."""
     random = np.random.default_rng(7)
     frames = []
@@ -145,9 +143,7 @@ class Messages:
     def serialized(self, message: Any) -> bytes:
         kind = message.__msgtype__
         ros1 = self.encoding == "ros1"
-        return bytes(
-            self.store.serialize_ros1(message, kind) if ros1 else self.store.serialize_cdr(message, kind)
-        )
+        return bytes(self.store.serialize_ros1(message, kind) if ros1 else self.store.serialize_cdr(message, kind))
 
 
 def rgbd_messages(make: Messages, frames: Iterable[RgbdFrame]) -> list[Sample]:

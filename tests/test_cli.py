@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import os
 import shutil
@@ -125,20 +126,7 @@ def test_track_writes_every_format_and_the_settings(run: Run, folder: Path, tmp_
     code, out, _ = run("track", folder, "--diameter", "24mm", "--color", COLOR, "--out", *outputs, "--picture", "r.png")
     assert code == 0, out
     table = rows(tmp_path / "r.csv")
-    assert list(table[0]) == [
-        "frame",
-        "stamp_ns",
-        "waypoint",
-        "status",
-        "arc_length",
-        "x",
-        "y",
-        "z",
-        "qx",
-        "qy",
-        "qz",
-        "qw",
-    ]
+    assert ",".join(table[0]) == "frame,stamp_ns,waypoint,status,arc_length,x,y,z,qx,qy,qz,qw"
     assert {row["frame"] for row in table} == {str(k) for k in range(FRAMES)}
     with np.load(tmp_path / "r.npz", allow_pickle=False) as arrays:
         assert len(arrays["positions"]) == len(table)
@@ -325,9 +313,7 @@ def test_stamps_that_repeat_and_run_back(run: Run, tmp_path: Path) -> None:
     frames = rope_frames()
     stamps = [frame.stamp_ns for frame in frames]
     stamps[3], stamps[5] = stamps[2], stamps[1]
-    changed = [
-        RgbdFrame(s, f.depth, f.depth_unit_m, f.intrinsics, f.color) for s, f in zip(stamps, frames, strict=True)
-    ]
+    changed = [dataclasses.replace(frame, stamp_ns=stamp) for frame, stamp in zip(frames, stamps, strict=True)]
     write_mcap(tmp_path / "rope.mcap", changed)
     code, out, _ = run("track", "rope.mcap", "-d", "24mm", "-c", COLOR, "--out", "r.csv")
     assert code == 0

@@ -222,9 +222,7 @@ def test_jpeg_colour(folder: Path) -> None:
     assert np.abs(frame.color.astype(int) - [250, 10, 20]).max() < 6
 
 
-@pytest.mark.parametrize(
-    "path", ["../secret.png", "/etc/passwd", "depth/../../x.png", "link/x.png", "depth/out.png"]
-)
+@pytest.mark.parametrize("path", ["../secret.png", "/etc/passwd", "depth/../../x.png", "link/x.png", "depth/out.png"])
 def test_paths_must_not_leave_the_folder(folder: Path, path: str) -> None:
     (folder / "link").symlink_to(folder.parent)
     (folder / "depth" / "out.png").symlink_to("/etc/passwd")
@@ -244,9 +242,7 @@ def test_unreadable_lines_are_a_problem(folder: Path) -> None:
     with (folder / "depth.txt").open("ab") as stream:
         stream.write(b"nonsense here\n\xff\xfe 1\n12.5")
     recording = open_recording(folder)
-    assert recording.problems == [
-        "depth.txt: 3 lines are not 'seconds path' and are left out, the first is line 7"
-    ]
+    assert recording.problems == ["depth.txt: 3 lines are not 'seconds path' and are left out, the first is line 7"]
     assert contents(recording.frames()) == contents(make_frames(5))
 
 
@@ -455,9 +451,7 @@ def test_pairing_when_the_clock_is_set_back() -> None:
 )
 def test_pairing_equals_a_search_over_everything(colors: list[int], delay: int, gap: int) -> None:
     depths = list(range(0, 500, 33))
-    arrivals = sorted(
-        [(time, "color", time) for time in colors] + [(time + delay, "depth", time) for time in depths]
-    )
+    arrivals = sorted([(time, "color", time) for time in colors] + [(time + delay, "depth", time) for time in depths])
     found = paired([(stream, stamp) for _, stream, stamp in arrivals], gap)
     for depth in depths:
         best = min(abs(color - depth) for color in colors)

@@ -25,9 +25,7 @@ COLORS = np.random.default_rng(4).integers(0, 256, (20, 3)).astype(np.uint8)
 
 def ply(form: str = "binary_little_endian", count: Any = 20, colors: bool = True, extra: str = "") -> bytes:
     order = ">" if form == "binary_big_endian" else "<"
-    fields = [(name, order + "f4") for name in "xyz"] + [
-        (name, "u1") for name in ("red", "green", "blue")
-    ] * colors
+    fields = [(name, order + "f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")] * colors
     table = np.zeros(20, fields)
     for axis, (position, color) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
         table[position] = POINTS[:, axis]

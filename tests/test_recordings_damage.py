@@ -104,10 +104,7 @@ def test_truncated_mcap_states_the_loss(tmp_path: Path) -> None:
     recording = open_recording(tmp_path / "cut.mcap")
     found = list(recording.frames())
     assert recording.frame_count == len(found)
-    assert (
-        recording.problems[0]
-        == "the end of the file is missing or damaged: it was not closed, or was cut off"
-    )
+    assert recording.problems[0] == "the end of the file is missing or damaged: it was not closed, or was cut off"
     assert "beyond the end): the rest is lost" in recording.problems[1]
     assert "whole messages were recovered; how many there were is not known" in recording.problems[2]
 
@@ -299,9 +296,7 @@ def make_sample(kind: str, folder: Path) -> Path:
     """A sound recording of a kind; what is mutated is the file that is returned."""
     if kind.startswith("mcap"):
         compression = CompressionType[kind.partition("-")[2].upper()]
-        return write_mcap(
-            folder / "a.mcap", rgbd_messages(ROS2, FRAMES), chunk_size=500, compression=compression
-        )
+        return write_mcap(folder / "a.mcap", rgbd_messages(ROS2, FRAMES), chunk_size=500, compression=compression)
     if kind.startswith("bag"):
         return write_bag(folder / "a.bag", rgbd_messages(ROS1, FRAMES), kind.partition("-")[2], 500)
     if kind == "db3":

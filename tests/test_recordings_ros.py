@@ -131,10 +131,7 @@ def test_mcap_writer_roundtrip_is_exact(tmp_path: Path, kind: type, color: bool)
 def test_what_the_mcap_writer_wrote_survives_a_kill(tmp_path: Path) -> None:
     camera = Intrinsics(160, 120, 100, 100, 80, 60)
     random = np.random.default_rng(0)
-    frames = [
-        RgbdFrame(i, random.integers(0, 65536, (120, 160)).astype(np.uint16), 0.001, camera)
-        for i in range(12)
-    ]
+    frames = [RgbdFrame(i, random.integers(0, 65536, (120, 160)).astype(np.uint16), 0.001, camera) for i in range(12)]
     with McapFrameWriter(tmp_path / "a.mcap", camera, 0.001) as writer:
         for frame in frames:
             writer.write(frame)
@@ -270,9 +267,7 @@ def test_compressed_depth_that_is_none(tmp_path: Path) -> None:
     stream = io.BytesIO()
     Image.new("L", (8, 6)).save(stream, "JPEG")
     topic = DEPTH + "/compressedDepth"
-    good = ROS2.compressed(
-        0, bytes(12) + images.encode_png(np.ones((6, 8), np.uint16)), "16UC1; compressedDepth png"
-    )
+    good = ROS2.compressed(0, bytes(12) + images.encode_png(np.ones((6, 8), np.uint16)), "16UC1; compressedDepth png")
     for data, declared, words in (
         (bytes(12) + b"\x01\x02" * 40, "16UC1; compressedDepth rvl", "not PNG"),
         (stream.getvalue(), "16UC1; jpeg compressed", "JPEG, which destroys depth"),
@@ -283,9 +278,7 @@ def test_compressed_depth_that_is_none(tmp_path: Path) -> None:
             "impossible",
         ),
     ):
-        rows = with_camera(
-            *((topic, COMPRESSED, 0, row) for row in (good, ROS2.compressed(1, data, declared)))
-        )
+        rows = with_camera(*((topic, COMPRESSED, 0, row) for row in (good, ROS2.compressed(1, data, declared))))
         assert words in read(tmp_path, rows, depth_topic=topic)[1].reason
 
 
@@ -330,16 +323,12 @@ def test_camera_that_changes_makes_bad_frames(tmp_path: Path) -> None:
 def test_aligned_depth_comes_first_and_colour_of_its_camera(tmp_path: Path) -> None:
     aligned = "/camera/aligned_depth_to_color"
     rows: list[Sample] = []
-    for number, topic in enumerate(
-        ("/camera/depth/image_rect_raw", aligned + "/image_raw", "/other/depth/image_raw")
-    ):
+    for number, topic in enumerate(("/camera/depth/image_rect_raw", aligned + "/image_raw", "/other/depth/image_raw")):
         rows.append((topic, IMAGE, 0, ROS2.image(0, np.full((6, 8), number, np.uint16), "16UC1")))
         rows.append((topic.rsplit("/", 1)[0] + "/camera_info", CAMERA, 0, ROS2.camera(0, fx=10.0 + number)))
     for topic, value in (("/web/image_raw", 1), (COLOR, 2)):
         rows.append((topic, IMAGE, 0, ROS2.image(0, np.full((6, 8, 3), value, np.uint8), "rgb8")))
-    rows.append(
-        ("/camera/infra1/image_rect_raw", IMAGE, 0, ROS2.image(0, np.ones((6, 8), np.uint8), "mono8"))
-    )
+    rows.append(("/camera/infra1/image_rect_raw", IMAGE, 0, ROS2.image(0, np.ones((6, 8), np.uint8), "mono8")))
     (frame,) = read(tmp_path, rows)
     assert (frame.depth[0, 0], frame.intrinsics.fx, frame.color[0, 0, 0]) == (1, 11.0, 2)
     (frame,) = read(tmp_path, rows, depth_topic="/other/depth/image_raw", color_topic="/web/image_raw")
@@ -351,9 +340,7 @@ def test_aligned_depth_comes_first_and_colour_of_its_camera(tmp_path: Path) -> N
 def test_topics_that_cannot_be_chosen(tmp_path: Path) -> None:
     image = ROS2.image(0, np.ones((6, 8), np.uint16), "16UC1")
     two = with_camera(("/a/depth", IMAGE, 0, image), ("/b/depth", IMAGE, 0, image))
-    with pytest.raises(
-        RecordingError, match=r"several topics may be the depth: /a/depth, /b/depth.*--depth-topic"
-    ):
+    with pytest.raises(RecordingError, match=r"several topics may be the depth: /a/depth, /b/depth.*--depth-topic"):
         read(tmp_path, two)
     with pytest.raises(RecordingError, match=r"no topic '/c'; it holds .*/a/depth \(sensor_msgs/msg/Image\)"):
         read(tmp_path, two, depth_topic="/c")
@@ -379,9 +366,7 @@ def test_unknown_types_are_ignored(tmp_path: Path) -> None:
 
 def test_depth_without_its_colour_is_a_bad_frame(tmp_path: Path) -> None:
     frames = make_frames(4)
-    rows = [
-        row for row in rgbd_messages(ROS2, frames) if not (row[0] == COLOR and row[2] == frames[2].stamp_ns)
-    ]
+    rows = [row for row in rgbd_messages(ROS2, frames) if not (row[0] == COLOR and row[2] == frames[2].stamp_ns)]
     path = write_mcap(tmp_path / "a.mcap", rows)
     assert reasons(open_recording(path)) == [
         f"{DEPTH}: no colour image within 20 ms of this depth image (the nearest is 33.3333 ms away)"
@@ -391,9 +376,7 @@ def test_depth_without_its_colour_is_a_bad_frame(tmp_path: Path) -> None:
 
 def test_colour_that_is_not_registered_is_a_problem(tmp_path: Path) -> None:
     color = ROS2.image(0, np.ones((6, 8, 3), np.uint8), "rgb8", header=ROS2.header(0, "other"))
-    rows = with_camera(
-        (COLOR, IMAGE, 0, color), (DEPTH, IMAGE, 0, ROS2.image(0, np.ones((6, 8), np.uint16), "16UC1"))
-    )
+    rows = with_camera((COLOR, IMAGE, 0, color), (DEPTH, IMAGE, 0, ROS2.image(0, np.ones((6, 8), np.uint16), "16UC1")))
     read(tmp_path, rows)
     assert "not registered" in open_recording(tmp_path / "a.mcap").problems[0]
 
@@ -410,9 +393,7 @@ def test_clouds(tmp_path: Path, order: str, kind: str, height: int) -> None:
     points[3] = np.nan
     colors = random.integers(0, 256, (12, 3))
     names = ("ring", "z", "x", "y", "rgb")
-    table = np.zeros(
-        12, np.dtype([(n, order + k) for n, k in zip(names, ("u2", kind, kind, kind, "u4"), strict=True)])
-    )
+    table = np.zeros(12, np.dtype([(n, order + k) for n, k in zip(names, ("u2", kind, kind, kind, "u4"), strict=True)]))
     for axis, name in enumerate("xyz"):
         table[name] = points[:, axis]
     table["rgb"] = colors @ [65536, 256, 1]
