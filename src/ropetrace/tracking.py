@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from ropetrace.errors import FrameError
+from ropetrace.results.base import uninterrupted
 from ropetrace.trackers.base import Tracker
 from ropetrace.types import BadFrame, Cloud, Estimate, FloatArray, Frame, Status
 
@@ -140,11 +141,13 @@ def track_recording(
             if cloud is not None and world_from_camera is not None:
                 cloud = Cloud(_moved(cloud.points, world_from_camera), cloud.node)
             watch.lap("")
-            for sink in sinks:
-                sink.write(index, estimate, None if isinstance(event, BadFrame) else event, cloud)
+            # A frame is in all results and in the summary, or in none.
+            with uninterrupted():
+                for sink in sinks:
+                    sink.write(index, estimate, None if isinstance(event, BadFrame) else event, cloud)
+                summary.add(estimate)
             if sinks:
                 watch.lap("write")
-            summary.add(estimate)
             if on_frame is not None:
                 on_frame(estimate)
             index += 1

@@ -40,8 +40,6 @@ class SlicingTracker:
         slicing = self.config.slicing
         assert slicing.variance_threshold is not None
         self._slicer = Slicer(slicing.variance_threshold, slicing.min_points, slicing.max_nodes)
-        self._points: FloatArray = np.empty((3, 0))
-        self._slices: Slices | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -49,6 +47,10 @@ class SlicingTracker:
         self._chain: FloatArray | None = None
         self._waypoints: Waypoints | None = None
         self._stamp_ns: int | None = None
+        self._points: FloatArray = np.empty((3, 0))
+        self._slices: Slices | None = None
+        if self.config.segmentation.color_pixel is not None:
+            self._segmenter.gate = None
 
     def update(self, frame: Frame, lap: Lap = no_lap) -> Estimate:
         """The estimate of one frame.
@@ -59,7 +61,7 @@ class SlicingTracker:
             If colour is asked for and the frame has none, or the mask does not fit the frame.
         """
         reasons = self._stamp_trouble(frame.stamp_ns)
-        self._slices = None
+        self._points, self._slices = np.empty((3, 0)), None
 
         points, count, stride = self.rope_points(frame)
         lap("segmentation")
@@ -129,6 +131,7 @@ class SlicingTracker:
     def rope_points(self, frame: Frame) -> tuple[FloatArray, int, int]:
         """The points to use, (3, N); how many passed the gates; and the stride that took these from them."""
         mask = self._mask(frame) if callable(self._mask) else self._mask
+        mask = None if mask is None else np.asarray(mask)
         shape = frame.depth.shape if isinstance(frame, RgbdFrame) else (len(frame.points),)
         if mask is not None and (mask.shape != shape or mask.dtype != np.bool_):
             raise FrameError(f"the mask is {mask.dtype} of shape {mask.shape}: expected bool of shape {shape}")
@@ -193,10 +196,15 @@ class SlicingTracker:
         return slices, trouble
 
     def _runs_backwards(self, chain: FloatArray) -> bool:
-        if self.config.ordering.follow_previous and self._chain is not None:
+        ordering = self.config.ordering
+        if ordering.follow_previous and self._chain is not None:
             return runs_backwards(chain, self._chain)
-        scores = end_scores(chain, self.config.ordering.first_point)
-        return bool(scores[-1] > scores[0])
+        if ordering.method == "greedy":
+            return False  # it started where equation 12 says
+        if ordering.first_point is None:
+            return bool(chain[-1, 1] < chain[0, 1])
+        distances = np.linalg.norm(chain[[0, -1]] - np.array(ordering.first_point), axis=1)
+        return bool(distances[1] < distances[0])
 
 
 BRIDGE_DIAMETERS = 5.0
