@@ -1,0 +1,208 @@
+"""A run over a recording: every event gets its row, sinks see them in order, and the user may interrupt."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from helpers import RED_TEXT, SHAPES, SMALL, random_rotation, seen
+from ropetrace.config import RopeConfig
+from ropetrace.errors import OutputError
+from ropetrace.trackers import SlicingTracker
+from ropetrace.tracking import Event, Summary, in_world, track_recording
+from ropetrace.types import BadFrame, Cloud, Estimate, Frame, RgbdFrame, Status
+
+HANGING = SHAPES["hanging"]
+CONFIG = RopeConfig(diameter=0.012, color=RED_TEXT)
+
+
+class Keeper:
+    """A sink that keeps what it is given, and may be told to fail."""
+
+    def __init__(
+        self, log: list[str] | None = None, name: str = "", fail_at: int = -1, error: BaseException | None = None
+    ):
+        self.rows: list[tuple[int, Estimate, Frame | None, Cloud | None]] = []
+        self._log, self._name, self._fail_at, self._error = log, name, fail_at, error
+
+    def write(self, index: int, estimate: Estimate, frame: Frame | None, cloud: Cloud | None) -> None:
+        if index == self._fail_at and self._error is not None:
+            raise self._error
+        self.rows.append((index, estimate, frame, cloud))
+        if self._log is not None:
+            self._log.append(f"{self._name}{index}")
+
+
+def good(stamp_ns: int) -> RgbdFrame:
+    return seen(HANGING, stamp_ns=stamp_ns)
+
+
+def colorless(stamp_ns: int) -> RgbdFrame:
+    return RgbdFrame(stamp_ns, good(0).depth, 1.0, SMALL)
+
+
+def run(events: list[Event], *sinks: Keeper, **options: object) -> Summary:
+    return track_recording(events, SlicingTracker(CONFIG), sinks, **options)  # type: ignore[arg-type]
+
+
+def test_every_event_has_its_row_in_order() -> None:
+    keeper = Keeper()
+    events: list[Event] = [good(10), BadFrame(20, "depth image 1 is damaged"), colorless(30), good(40)]
+    summary = run(events, keeper, first_index=7)
+    assert [index for index, *_ in keeper.rows] == [7, 8, 9, 10]
+    assert [estimate.stamp_ns for _, estimate, *_ in keeper.rows] == [10, 20, 30, 40]
+    assert [estimate.status.value for _, estimate, *_ in keeper.rows] == ["ok", "lost", "lost", "ok"]
+    assert keeper.rows[1][1].reasons == ("depth image 1 is damaged",)
+    assert "frame has none" in keeper.rows[2][1].reasons[0]
+    assert [frame for _, _, frame, _ in keeper.rows] == [events[0], None, events[2], events[3]]
+    assert (summary.frames, summary.found, summary.interrupted) == (4, 2, False)
+    assert summary.statuses == {Status.OK: 2, Status.LOST: 2}
+
+
+def test_each_frame_goes_to_all_sinks_before_the_next() -> None:
+    log: list[str] = []
+    run([good(1), good(2)], Keeper(log, "a"), Keeper(log, "b"))
+    assert log == ["a0", "b0", "a1", "b1"]
+
+
+def test_progress_is_told_of_each_frame() -> None:
+    told: list[Estimate] = []
+    run([good(1), BadFrame(2, "x")], on_frame=told.append)
+    assert [estimate.stamp_ns for estimate in told] == [1, 2]
+
+
+def test_an_empty_recording() -> None:
+    summary = run([], Keeper())
+    assert (summary.frames, summary.found) == (0, 0)
+    assert summary.lines() == ["frames    0 (0 ok, 0 degraded, 0 lost)"]
+
+
+def test_clouds_are_those_of_their_frame_and_only_on_request() -> None:
+    keeper = Keeper()
+    run([good(1), BadFrame(2, "x"), colorless(3)], keeper, wants_cloud=True)
+    clouds = [cloud for *_, cloud in keeper.rows]
+    assert clouds[0] is not None
+    assert len(clouds[0].points) == keeper.rows[0][1].point_count > 1000
+    assert clouds[1] is None
+    assert clouds[2] is None or len(clouds[2].points) == 0, "the points of another frame"
+    keeper = Keeper()
+    run([good(1)], keeper)
+    assert keeper.rows[0][3] is None
+
+
+# --- interruptions and failures ---
+
+
+def test_an_interrupted_source_ends_the_run_and_is_told() -> None:
+    def source() -> Iterator[Event]:
+        yield good(1)
+        yield good(2)
+        raise KeyboardInterrupt
+
+    keeper = Keeper()
+    summary = track_recording(source(), SlicingTracker(CONFIG), [keeper])
+    assert summary.interrupted
+    assert summary.frames == len(keeper.rows) == 2
+
+
+@pytest.mark.parametrize("fail_at", [0, 1])
+def test_an_interrupted_sink_ends_the_run_and_is_told(fail_at: int) -> None:
+    before, after = Keeper(), Keeper()
+    summary = run([good(1), good(2), good(3)], before, Keeper(fail_at=fail_at, error=KeyboardInterrupt()), after)
+    assert summary.interrupted
+    assert summary.frames == len(after.rows) == fail_at
+    assert len(before.rows) == fail_at + 1
+
+
+def test_ctrl_c_while_a_frame_is_written_waits_for_its_other_sinks() -> None:
+    class Interrupter(Keeper):
+        def write(self, index: int, estimate: Estimate, frame: Frame | None, cloud: Cloud | None) -> None:
+            super().write(index, estimate, frame, cloud)
+            if index == 1:
+                signal.raise_signal(signal.SIGINT)
+
+    first, last = Interrupter(), Keeper()
+    summary = run([good(1), good(2), good(3)], first, last)
+    assert summary.interrupted
+    assert summary.frames == len(first.rows) == len(last.rows) == 2
+
+
+def test_a_sink_that_cannot_write_ends_the_run_with_its_error() -> None:
+    with pytest.raises(OutputError, match="disk full"):
+        run([good(1), good(2)], Keeper(fail_at=1, error=OutputError("disk full")))
+
+
+def test_an_error_of_the_tracker_itself_is_not_hidden() -> None:
+    def broken(frame: Frame) -> object:
+        raise ZeroDivisionError("a bug")
+
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        track_recording([good(1)], SlicingTracker(CONFIG, broken))  # type: ignore[arg-type]
+
+
+# --- the world's frame ---
+
+
+def test_everything_is_handed_on_in_the_worlds_frame() -> None:
+    rng = np.random.default_rng(0)
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = random_rotation(rng), [1.0, -2.0, 0.5]
+    plain, placed = Keeper(), Keeper()
+    events: list[Event] = [good(1), BadFrame(2, "x")]
+    run(events, plain, wants_cloud=True)
+    run(events, placed, wants_cloud=True, world_from_camera=transform)
+    (_, camera, _, camera_cloud), (_, world, _, world_cloud) = plain.rows[0], placed.rows[0]
+    assert camera_cloud is not None
+    assert world_cloud is not None
+
+    def moved(points: np.ndarray) -> np.ndarray:
+        return np.asarray((np.column_stack([points, np.ones(len(points))]) @ transform.T)[:, :3])
+
+    np.testing.assert_allclose(world.nodes, moved(camera.nodes), atol=1e-12)
+    np.testing.assert_allclose(world.waypoints.positions, moved(camera.waypoints.positions), atol=1e-12)
+    np.testing.assert_allclose(world_cloud.points, moved(camera_cloud.points), atol=1e-12)
+    np.testing.assert_array_equal(world_cloud.node, camera_cloud.node)
+    np.testing.assert_allclose(
+        Rotation.from_quat(world.waypoints.quaternions).as_matrix(),
+        transform[:3, :3] @ Rotation.from_quat(camera.waypoints.quaternions).as_matrix(),
+        atol=1e-9,
+    )
+    assert (world.status, world.stamp_ns, world.point_count) == (camera.status, camera.stamp_ns, camera.point_count)
+    assert len(placed.rows[1][1].nodes) == 0
+
+
+def test_a_lost_estimate_stays_lost_in_the_world() -> None:
+    lost = in_world(Estimate.lost(3, "why", 5), np.eye(4))
+    assert (lost.status, lost.reasons, lost.nodes.shape, lost.point_count) == (Status.LOST, ("why",), (0, 3), 5)
+
+
+# --- the summary ---
+
+
+def test_stages_are_timed_for_the_frames_that_reached_them() -> None:
+    summary = run([good(1), BadFrame(2, "x"), colorless(3), good(4)], Keeper())
+    counts = {stage: len(seconds) for stage, seconds in summary.stage_seconds.items()}
+    assert counts == {"read": 4, "segmentation": 2, "slicing": 2, "ordering": 2, "centerline": 2, "write": 4}
+    assert all(second >= 0 for seconds in summary.stage_seconds.values() for second in seconds)
+    assert "write" not in run([good(1)]).stage_seconds
+
+
+def test_the_summary_counts_like_reasons_together() -> None:
+    summary = Summary()
+    for index in range(3):
+        summary.add(Estimate.lost(index, f"too few points ({index})"))
+    summary.add(Estimate.lost(9, "something else"))
+    assert summary.reasons.most_common(1) == [("too few points #", 3)]
+    lines = summary.lines()
+    assert lines[0] == "frames    4 (0 ok, 0 degraded, 4 lost)"
+    assert lines[1].endswith("3 x too few points #")
+
+
+def test_the_summary_tells_lengths_and_times() -> None:
+    text = "\n".join(run([good(1), good(2)], Keeper()).lines())
+    for word in ("2 ok", "points    ", "nodes     ", "length    0.6", "segmentation", "p99 ms", "write"):
+        assert word in text
