@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -457,7 +456,9 @@ def test_the_doctor_names_the_trouble(
 
 @needs_data
 def test_the_real_rope_from_the_command_line(run: Run, tmp_path: Path) -> None:
-    code, _, _ = run("track", DATA / "bcpd_rope_d435", "--rate", 5, "--diameter", "6mm", "--out", "r.csv")
+    code, out, _ = run("track", DATA / "bcpd_rope_d435", "--rate", 5, "--diameter", "6mm", "--out", "r.csv")
     assert code == 0
-    assert statuses(tmp_path / "r.csv") == dict.fromkeys(range(6), "ok")
-    assert os.listdir(tmp_path) != []
+    # The rope has gaps of 2 to 4 cm, and in the last frame its ends cross: the curve is there, and the doubt is told.
+    assert statuses(tmp_path / "r.csv") == dict.fromkeys(range(6), "degraded")
+    for reason in ("is bridged", "strands overlap"):
+        assert reason in out

@@ -76,11 +76,16 @@ def cloud_frame(points: FloatArray, stamp_ns: int = 0) -> CloudFrame:
 
 # --- shapes, end to end ---
 
+CROSSING = ("crossing loop",)
+
 
 @pytest.mark.parametrize("name", [name for name in SHAPES if name != "helix"])
 def test_every_shape_is_tracked_from_end_to_end(name: str) -> None:
     estimate = update(SlicingTracker(RED_ROPE), seen(SHAPES[name], camera=LARGE))
-    assert estimate.status is Status.OK, estimate.reasons
+    if name in CROSSING:
+        assert any("strands overlap" in reason for reason in estimate.reasons)
+    else:
+        assert estimate.status is Status.OK, estimate.reasons
     assert worst_at_equal_length(estimate.waypoints.positions, SHAPES[name]) < 0.02
     assert symmetric_mean(estimate.waypoints.positions, SHAPES[name]) < 0.001
 
@@ -264,7 +269,9 @@ def test_lines_and_planes_do_not_break_it() -> None:
     rng = np.random.default_rng(0)
     t = np.linspace(-0.3, 0.3, 1500)
     line = np.stack([t, 0.3 * t, 1 + 0.1 * t], axis=1)
-    assert update(SlicingTracker(ROPE), cloud_frame(line)).status is Status.OK
+    thin = update(SlicingTracker(ROPE), cloud_frame(line))
+    assert "as wide as a tube of" in thin.reasons[0]
+    assert symmetric_mean(thin.waypoints.positions, line) < 0.01
     toward = np.stack([0 * t, 0 * t, 1 + t], axis=1)
     update(SlicingTracker(ROPE), cloud_frame(toward))
     plane = np.column_stack([rng.uniform(-0.3, 0.3, (4000, 2)), np.ones(4000)])
@@ -554,9 +561,9 @@ def test_stages_are_told_in_order() -> None:
 def test_the_diameter_that_is_seen() -> None:
     for diameter in (0.01, 0.015):
         tracker = SlicingTracker(RopeConfig(diameter=diameter))
-        assert tracker.seen_diameter() == 0.0
+        assert tracker.seen_diameter == 0.0
         tracker.update(seen(HANGING, diameter / 2, LARGE))
-        assert tracker.seen_diameter() == pytest.approx(diameter, rel=0.1)
+        assert tracker.seen_diameter == pytest.approx(diameter, rel=0.1)
 
 
 # --- settings reach what they set ---

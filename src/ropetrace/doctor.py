@@ -323,7 +323,7 @@ def _check_tracking(diagnosis: Diagnosis, frames: list[Frame], config: RopeConfi
         if estimate.status is Status.LOST:
             continue
         lengths.append(estimate.waypoints.length)
-        widths.append(tracker.seen_diameter())
+        widths.append(tracker.seen_diameter)
         if isinstance(frame, RgbdFrame):
             pixels.append(config.diameter * frame.intrinsics.fx / float(np.median(estimate.nodes[:, 2])))
     text = f"tracked: {statuses[Status.OK]} ok, {statuses[Status.DEGRADED]} degraded, {statuses[Status.LOST]} lost"

@@ -31,6 +31,12 @@ _TOUCH = 0.2
 _LONGEST_MOVE = 3
 """Nodes that the search moves together."""
 
+SEARCH_BUDGET = 250_000
+"""Changes of the order that are looked at in one frame, at most: some ten milliseconds."""
+
+_NEIGHBOURHOOD = 3.0
+"""Stretches of a chain closer than this along it, in diameters, are neighbours and may touch."""
+
 _MOST_PIECES = 8
 """Pieces that the chain is cut into at once: the time grows with 4^n."""
 
@@ -80,6 +86,9 @@ def order_path(graph: NodeGraph) -> Indices:
     edges, as Kruskal's algorithm picks them. Then, until nothing is gained, the chain is cut at its worst joints and
     the pieces are put together in the best of all orders (Held and Karp's dynamic programme), stretches are turned
     round (2-opt) and single nodes moved (or-opt).
+
+    The search ends when `SEARCH_BUDGET` changes have been looked at: a rope needs a few thousand, hundreds of nodes
+    that form no rope would take seconds.
 
     Returns
     -------
@@ -149,6 +158,21 @@ def end_scores(centroids: FloatArray, first_point: tuple[float, float, float] | 
     return np.asarray(spread - np.linalg.norm(centroids - np.array(first_point), axis=1))
 
 
+def strands_overlap(chain: FloatArray, diameter: float) -> bool:
+    """Whether two stretches of a chain that are not neighbours overlap in the camera's view, or nearly.
+
+    There the slices of both run into each other, and the way through is a guess.
+
+    Parameters
+    ----------
+    chain : (M, 3) float array
+        Nodes on the axis in order, metres, camera frame.
+    diameter : float
+        Of the rope, metres.
+    """
+    return bool(_strands_overlap(chain, diameter))
+
+
 def runs_backwards(chain: FloatArray, previous: FloatArray) -> bool:
     """Whether a chain runs from the previous chain's end to its start.
 
@@ -161,6 +185,51 @@ def runs_backwards(chain: FloatArray, previous: FloatArray) -> bool:
         Nodes in order, metres.
     """
     return bool(_runs_backwards(chain, previous))
+
+
+@njit(cache=True, nogil=True)
+def _strands_overlap(chain: Any, diameter: float) -> bool:
+    count = len(chain)
+    views = np.empty((count, 3))
+    ranges = np.empty(count)
+    length = np.zeros(count)
+    for i in range(count):
+        ranges[i] = max(np.sqrt(np.sum(chain[i] ** 2)), 1e-9)
+        views[i] = chain[i] / ranges[i]
+        if i:
+            length[i] = length[i - 1] + np.sqrt(np.sum((chain[i] - chain[i - 1]) ** 2))
+    for i in range(count - 1):
+        for j in range(i + 2, count - 1):
+            # A hairpin as tight as a rope can be brings stretches that are this far apart side by side.
+            if length[j] - length[i + 1] < _NEIGHBOURHOOD * diameter:
+                continue
+            near = min(ranges[i], ranges[i + 1], ranges[j], ranges[j + 1])
+            if _segment_distance(views[i], views[i + 1], views[j], views[j + 1]) * near < diameter:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _segment_distance(a: Any, b: Any, c: Any, d: Any) -> float:
+    """Least distance of two stretches ab and cd in space (Ericson, Real-Time Collision Detection, 2005, 5.1.9)."""
+    uu = vv = uv = uw = vw = 0.0
+    for k in range(3):
+        u, v, w = b[k] - a[k], d[k] - c[k], a[k] - c[k]
+        uu += u * u
+        vv += v * v
+        uv += u * v
+        uw += u * w
+        vw += v * w
+    across = uu * vv - uv * uv
+    s = min(max((uv * vw - uw * vv) / across, 0.0), 1.0) if across > 1e-12 * uu * vv else 0.0
+    t = (uv * s + vw) / vv if vv > 0 else 0.0
+    if t < 0.0 or t > 1.0 or vv == 0.0:
+        t = min(max(t, 0.0), 1.0)
+        s = min(max((uv * t - uw) / uu, 0.0), 1.0) if uu > 0 else 0.0
+    total = 0.0
+    for k in range(3):
+        total += (a[k] + s * (b[k] - a[k]) - c[k] - t * (d[k] - c[k])) ** 2
+    return np.sqrt(total)
 
 
 @njit(cache=True, nogil=True)
@@ -308,15 +377,18 @@ def _string(costs: Any, directions: Any, nodes: Any, count: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _improve(costs: Any, directions: Any, path: Any) -> None:
-    for _ in range(4 * len(path)):
+    budget = np.array([SEARCH_BUDGET])
+    while budget[0] > 0:
         if not (
-            _reassemble(costs, directions, path) or _exchange(costs, directions, path) or _move(costs, directions, path)
+            _reassemble(costs, directions, path, budget)
+            or _exchange(costs, directions, path, budget)
+            or _move(costs, directions, path, budget)
         ):
             break
 
 
 @njit(cache=True, nogil=True)
-def _reassemble(costs: Any, directions: Any, path: Any) -> bool:
+def _reassemble(costs: Any, directions: Any, path: Any, budget: Any) -> bool:
     """Cut the chain at its worst joints and put the pieces together in the best order; False if it was that already."""
     count = len(path)
     joints = np.zeros(count)
@@ -332,8 +404,8 @@ def _reassemble(costs: Any, directions: Any, path: Any) -> bool:
 
     # A piece and its direction are one number, 2 * piece + (1 if it runs backwards).
     turned = 2 * pieces
+    budget[0] -= (1 << pieces) * turned * turned // 8
     link = np.empty((turned, turned))
-    now = 0.0
     for a in range(turned):
         first_a, last_a = starts[a // 2], stops[a // 2] - 1
         tail = path[last_a] if a % 2 == 0 else path[first_a]
@@ -343,8 +415,6 @@ def _reassemble(costs: Any, directions: Any, path: Any) -> bool:
             head = path[first_b] if b % 2 == 0 else path[last_b]
             after = -1 if first_b == last_b else (path[first_b + 1] if b % 2 == 0 else path[last_b - 1])
             link[a, b] = _joint(costs, directions, before, tail, head, after)
-    for piece in range(pieces - 1):
-        now += link[2 * piece, 2 * piece + 2]
 
     best = np.full((1 << pieces, turned), np.inf)
     came = np.full((1 << pieces, turned), -1, np.int64)
@@ -364,8 +434,6 @@ def _reassemble(costs: Any, directions: Any, path: Any) -> bool:
                     came[more, b] = a
     used = (1 << pieces) - 1
     last = int(np.argmin(best[used]))
-    if best[used, last] > now - 1e-9:
-        return False
     old = path.copy()
     at = count
     while last >= 0:
@@ -373,11 +441,15 @@ def _reassemble(costs: Any, directions: Any, path: Any) -> bool:
         at -= len(piece)
         path[at : at + len(piece)] = piece if last % 2 == 0 else piece[::-1]
         last, used = came[used, last], used & ~(1 << (last // 2))
-    return True
+    # The links leave out the turn at a piece of a single node, so only the whole chain's cost tells.
+    if _string(costs, directions, path, count) < _string(costs, directions, old, count) - 1e-9:
+        return True
+    path[:] = old
+    return False
 
 
 @njit(cache=True, nogil=True)
-def _exchange(costs: Any, directions: Any, path: Any) -> bool:
+def _exchange(costs: Any, directions: Any, path: Any, budget: Any) -> bool:
     """Turn round the stretch of chain that gains most (2-opt); False if none gains."""
     count = len(path)
     joints = np.zeros(count + 1)
@@ -389,6 +461,7 @@ def _exchange(costs: Any, directions: Any, path: Any) -> bool:
             before = joints[first] + joints[last + 1]
             if before < _EASY or (joints[first] < _EASY and joints[last + 1] < _EASY):
                 continue
+            budget[0] -= 1
             gain = (
                 _joint(costs, directions, _at(path, first - 2), _at(path, first - 1), path[last], path[last - 1])
                 + _joint(costs, directions, path[first + 1], path[first], _at(path, last + 1), _at(path, last + 2))
@@ -403,7 +476,7 @@ def _exchange(costs: Any, directions: Any, path: Any) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _move(costs: Any, directions: Any, path: Any) -> bool:
+def _move(costs: Any, directions: Any, path: Any, budget: Any) -> bool:
     """Put a few nodes elsewhere in the chain, either way round, where that gains most (or-opt); False if none gains."""
     count = len(path)
     nodes = np.empty(_LONGEST_MOVE + 4, np.int64)
@@ -417,8 +490,9 @@ def _move(costs: Any, directions: Any, path: Any) -> bool:
                 continue
             nodes[2], nodes[3] = _at(path, first + size), _at(path, first + size + 1)
             removed -= _string(costs, directions, nodes, 4)
-            if removed < _EASY:
+            if removed < _EASY or budget[0] <= 0:
                 continue
+            budget[0] -= 2 * count
             for place in range(count - size + 1):
                 if place == first:
                     continue

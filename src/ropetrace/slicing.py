@@ -83,7 +83,8 @@ class Slicer:
         delta_sigma of equation 9, m^2.
     min_points : int, optional
         delta_O of equation 10: parts with fewer points are dropped. By default a quarter of the median part, at
-        least 2: what noise leaves over is smaller than what a rope gives at the same distance.
+        least 2: what noise leaves over is smaller than what a rope gives at the same distance. Parts of one or two
+        points, which stray points make, do not count for the median.
     max_nodes : int
         No more parts than this are made.
     """
@@ -110,7 +111,7 @@ class Slicer:
             (points[0], points[1], points[2]),
             (self._spare[0], self._spare[1], self._spare[2]),
             self.variance_threshold,
-            self.min_points or 1,
+            self.min_points or 2,
             moments,
             ranges,
         )
@@ -124,7 +125,9 @@ class Slicer:
         )
         if self.min_points is not None:
             return slices.kept(slices.counts >= self.min_points)
-        return slices.kept(slices.counts >= max(2.0, np.median(slices.counts) / 4)) if parts else slices
+        solid = slices.counts[slices.counts > 2]
+        least = max(2.0, np.median(solid) / 4) if len(solid) else 2.0
+        return slices.kept(slices.counts >= least)
 
 
 def axis_points(
@@ -133,7 +136,7 @@ def axis_points(
     tangents: FloatArray,
     radius: float,
     surface_offset: tuple[float, float, float] | None = None,
-) -> FloatArray:
+) -> tuple[FloatArray, FloatArray]:
     """Points on the rope's axis below the centroids of ordered slices of its visible surface (equation 11).
 
     Three things keep a centroid off the axis, and are taken back:
@@ -162,11 +165,14 @@ def axis_points(
 
     Returns
     -------
-    (M, 3) float array
+    nodes : (M, 3) float array
+        Metres.
+    widths : (M,) float array
+        How wide the slices look to the camera, metres: the square of the width over which points spread evenly is
+        twelve times their variance, and what the pixels' pitch takes from it.
     """
-    if surface_offset is not None:
-        return slices.centroids + np.array(surface_offset)
     nodes = np.empty_like(slices.centroids)
+    widths = np.empty(len(nodes))
     _axis_points(
         (points[0], points[1], points[2]),
         slices.starts,
@@ -176,8 +182,11 @@ def axis_points(
         tangents,
         radius,
         nodes,
+        widths,
     )
-    return nodes
+    if surface_offset is not None:
+        nodes = slices.centroids + np.array(surface_offset)
+    return nodes, widths
 
 
 @njit(cache=True, nogil=True)
@@ -190,6 +199,7 @@ def _axis_points(
     tangents: Any,
     radius: float,
     nodes: Any,
+    widths: Any,
 ) -> None:
     last = len(centroids) - 1
     away, side, bend = np.empty(3), np.empty(3), np.empty(3)
@@ -214,6 +224,9 @@ def _axis_points(
             i, j = (k + 1) % 3, (k + 2) % 3
             side[k] = t[i] * away[j] - t[j] * away[i]
         along, across = _variance(covariances[m], t), _variance(covariances[m], side)
+        # Rows of points p apart lose p^2 of the width's square; p^2 is the area that a point stands for.
+        pitch = np.sqrt(12 * along) / max(counts[m], 1)
+        widths[m] = (pitch + np.sqrt(pitch * pitch + 48 * across)) / 2
         depth, sideways = _profile(
             points, starts[m], starts[m] + counts[m], c, t, side, away, bend, along, across, radius
         )
@@ -251,7 +264,7 @@ def _profile(
     """
     seen = min(np.sqrt(3 * across) / radius, 1.0)
     mean_depth = radius * (0.5 * (np.sqrt(1 - seen * seen) + np.arcsin(seen) / seen) if seen > 1e-3 else 1.0)
-    if across > _WIDE * radius * radius / 3:
+    if stop - start < _FEWEST_FOR_FIT or across > _WIDE * radius * radius / 3:
         # More than one strand, or a blob: no round profile to fit.
         return mean_depth, 0.0
     x, y, z = points
@@ -288,7 +301,9 @@ def _profile(
         return mean_depth, 0.0
     scatter = max(vqq - vqg * vqg / vgg, 0.0) / (n - 2)
     pixel = 12 * np.sqrt(along * across) / (stop - start)
-    shift = -vqg / vgg * vgg / (vgg + scatter / (pixel / 16 + 1e-18))
+    # The pixels leave a quarter of their pitch open, as a standard deviation, and never more than half of it.
+    half = np.sqrt(pixel) / 2
+    shift = min(max(-vqg / (vgg + scatter / (pixel / 16 + 1e-18)), -half), half)
     return (sq + shift * sg) / n, shift
 
 

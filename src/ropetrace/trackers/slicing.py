@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ropetrace.centerline import chain_tangents, extend_to_tips, make_waypoints
 from ropetrace.config import RopeConfig, SegmentationConfig, parse_color
 from ropetrace.errors import FrameError
-from ropetrace.ordering import NodeGraph, end_scores, order_greedy, order_path, runs_backwards
+from ropetrace.ordering import NodeGraph, end_scores, order_greedy, order_path, runs_backwards, strands_overlap
 from ropetrace.segmentation import ColorGate, PositionBox, Segmenter
 from ropetrace.slicing import Slicer, Slices, axis_points
 from ropetrace.trackers.base import Lap, Mask, no_lap
@@ -40,6 +40,7 @@ class SlicingTracker:
         slicing = self.config.slicing
         assert slicing.variance_threshold is not None
         self._slicer = Slicer(slicing.variance_threshold, slicing.min_points, slicing.max_nodes)
+        self.seen_diameter = 0.0
         self.reset()
 
     def reset(self) -> None:
@@ -83,10 +84,11 @@ class SlicingTracker:
         reasons += trouble
         lap("ordering")
         if len(slices) < 2:
-            return Estimate.lost(frame.stamp_ns, "the points do not hang together", count)
+            return Estimate.lost(frame.stamp_ns, _scattered(points.shape[1]), count)
 
         tangents = chain_tangents(slices.centroids)
-        nodes = axis_points(points, slices, tangents, self.config.radius, self.config.slicing.surface_offset)
+        nodes, widths = axis_points(points, slices, tangents, self.config.radius, self.config.slicing.surface_offset)
+        reasons += self._shape_trouble(nodes, widths)
         chain = extend_to_tips(nodes, _reach(slices, tangents))
         assert self.config.centerline.spacing is not None
         waypoints = make_waypoints(chain, self.config.centerline.spacing, self._waypoints)
@@ -111,22 +113,6 @@ class SlicingTracker:
         if stamp_ns == previous:
             return ["the stamp repeats that of the frame before"]
         return [f"the stamp runs back by {(previous - stamp_ns) / 1e9:.3f} s"]
-
-    def seen_diameter(self) -> float:
-        """The diameter of a tube as wide as the last frame's slices look, metres; 0 if it had none.
-
-        The camera sees points spread evenly over a tube's width, whose variance is a twelfth of its square.
-        """
-        if self._slices is None:
-            return 0.0
-        widths = []
-        for centroid, covariance, tangent in zip(
-            self._slices.centroids, self._slices.covariances, chain_tangents(self._slices.centroids), strict=True
-        ):
-            side = np.cross(tangent, centroid)
-            side /= max(float(np.linalg.norm(side)), 1e-12)
-            widths.append(np.sqrt(12 * max(float(side @ covariance @ side), 0.0)))
-        return float(np.median(widths))
 
     def rope_points(self, frame: Frame) -> tuple[FloatArray, int, int]:
         """The points to use, (3, N); how many passed the gates; and the stride that took these from them."""
@@ -167,6 +153,7 @@ class SlicingTracker:
         """The slices along the rope from its start, without those that do not belong to it, and what to mistrust."""
         ordering = self.config.ordering
         graph = NodeGraph.of(slices.centroids, slices.covariances)
+        surface = bool(np.median(graph.touching) >= _SURFACE_NEIGHBOURS)
         if ordering.method == "greedy":
             order = order_greedy(slices.centroids, int(np.argmax(end_scores(slices.centroids, ordering.first_point))))
         else:
@@ -188,12 +175,30 @@ class SlicingTracker:
         bridged = gaps.max(initial=0.0)
         if bridged > BRIDGE_DIAMETERS * self.config.diameter:
             trouble.append(f"a gap of {bridged * 1e3:.0f} mm is bridged")
-        if np.median(graph.touching) >= _SURFACE_NEIGHBOURS:
+        if surface:
             trouble.append("the points form a surface, not a rope: background passes the colour or the position box")
         slices = slices.kept(order)
         if len(slices) > 1 and self._runs_backwards(slices.centroids):
             slices = slices.kept(np.arange(len(slices))[::-1])
         return slices, trouble
+
+    def _shape_trouble(self, nodes: FloatArray, widths: FloatArray) -> list[str]:
+        """What does not look like one tube of the stated diameter."""
+        diameter = self.config.diameter
+        self.seen_diameter = float(np.median(widths))
+        trouble = []
+        if not TOO_THIN * diameter < self.seen_diameter < TOO_WIDE * diameter:
+            trouble.append(
+                f"the points are as wide as a tube of {self.seen_diameter * 1e3:.1f} mm, not of "
+                f"{diameter * 1e3:.1f} mm: the diameter is wrong, or something else passes the colour or the box"
+            )
+        elif np.count_nonzero(widths > 2 * diameter) > 0.1 * len(widths):
+            trouble.append("parts are far wider than the rope: a hand, a knot or a branch is taken for rope")
+        if strands_overlap(nodes, diameter):
+            trouble.append("strands overlap in the camera's view: the order there may be wrong")
+        if np.median(nodes[:, 2]) > _FARTHEST:
+            trouble.append(f"the points are {np.median(nodes[:, 2]):.0f} m away: is the recording in millimetres?")
+        return trouble
 
     def _runs_backwards(self, chain: FloatArray) -> bool:
         ordering = self.config.ordering
@@ -207,8 +212,17 @@ class SlicingTracker:
         return bool(distances[1] < distances[0])
 
 
-BRIDGE_DIAMETERS = 5.0
-"""A gap of more diameters than this in the chain is worth telling."""
+BRIDGE_DIAMETERS = 3.0
+"""A gap of more diameters than this in the chain is worth telling; a strand that crosses hides one."""
+
+TOO_THIN, TOO_WIDE = 0.6, 1.5
+"""Between these, in diameters, a rope may look wide: lost edges and coarse pixels make it thinner, noise wider."""
+
+_FEW = 20
+"""Fewer points than this make no rope, however they lie."""
+
+_FARTHEST = 50.0
+"""No depth camera sees a rope from this far, metres."""
 
 _ALONG_VIEW = 0.3
 """How much a gap along the view counts: a rope that leads away from the camera hides its own next stretch."""
@@ -234,11 +248,15 @@ def _reach(slices: Slices, tangents: FloatArray) -> tuple[float, float]:
 
 
 def _too_little(points: int, slices: int) -> str:
-    if slices == 1 and points >= 20:
+    if slices == 1 and points >= _FEW:
         return (
             f"{points} points make a single slice: the diameter (or slicing.variance_threshold) is too large for them"
         )
-    return f"too few points ({points})"
+    return _scattered(points)
+
+
+def _scattered(points: int) -> str:
+    return f"too few points ({points})" if points < _FEW else "the points do not hang together"
 
 
 def _color_gate(config: RopeConfig) -> ColorGate | None:
