@@ -34,6 +34,9 @@ _LONGEST_MOVE = 3
 SEARCH_BUDGET = 250_000
 """Changes of the order that are looked at in one frame, at most: some ten milliseconds."""
 
+_OVERLAP = 1.5
+"""Strands whose axes come closer in the view than this, in diameters, may share slices."""
+
 _NEIGHBOURHOOD = 3.0
 """Stretches of a chain closer than this along it, in diameters, are neighbours and may touch."""
 
@@ -173,6 +176,11 @@ def strands_overlap(chain: FloatArray, diameter: float) -> bool:
     return bool(_strands_overlap(chain, diameter))
 
 
+def sharpest_turn(chain: FloatArray) -> float:
+    """The largest turn at a node of a chain, radians; 0 for fewer than three nodes."""
+    return float(_sharpest_turn(chain))
+
+
 def runs_backwards(chain: FloatArray, previous: FloatArray) -> bool:
     """Whether a chain runs from the previous chain's end to its start.
 
@@ -204,9 +212,23 @@ def _strands_overlap(chain: Any, diameter: float) -> bool:
             if length[j] - length[i + 1] < _NEIGHBOURHOOD * diameter:
                 continue
             near = min(ranges[i], ranges[i + 1], ranges[j], ranges[j + 1])
-            if _segment_distance(views[i], views[i + 1], views[j], views[j + 1]) * near < diameter:
+            if _segment_distance(views[i], views[i + 1], views[j], views[j + 1]) * near < _OVERLAP * diameter:
                 return True
     return False
+
+
+@njit(cache=True, nogil=True)
+def _sharpest_turn(chain: Any) -> float:
+    least = 1.0
+    for i in range(1, len(chain) - 1):
+        before = after = product = 0.0
+        for k in range(3):
+            u, v = chain[i, k] - chain[i - 1, k], chain[i + 1, k] - chain[i, k]
+            before += u * u
+            after += v * v
+            product += u * v
+        least = min(least, product / max(np.sqrt(before * after), 1e-300))
+    return np.arccos(max(least, -1.0))
 
 
 @njit(cache=True, nogil=True)

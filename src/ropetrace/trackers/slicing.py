@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from ropetrace.centerline import chain_tangents, extend_to_tips, make_waypoints
 from ropetrace.config import RopeConfig, SegmentationConfig, parse_color
 from ropetrace.errors import FrameError
-from ropetrace.ordering import NodeGraph, end_scores, order_greedy, order_path, runs_backwards, strands_overlap
+from ropetrace.ordering import (
+    NodeGraph,
+    end_scores,
+    order_greedy,
+    order_path,
+    runs_backwards,
+    sharpest_turn,
+    strands_overlap,
+)
 from ropetrace.segmentation import ColorGate, PositionBox, Segmenter
 from ropetrace.slicing import Slicer, Slices, axis_points
 from ropetrace.trackers.base import Lap, Mask, no_lap
@@ -196,6 +204,8 @@ class SlicingTracker:
             trouble.append("parts are far wider than the rope: a hand, a knot or a branch is taken for rope")
         if strands_overlap(nodes, diameter):
             trouble.append("strands overlap in the camera's view: the order there may be wrong")
+        elif sharpest_turn(nodes) > _KINK:
+            trouble.append("the curve turns back sharply: the order there may be wrong")
         if np.median(nodes[:, 2]) > _FARTHEST:
             trouble.append(f"the points are {np.median(nodes[:, 2]):.0f} m away: is the recording in millimetres?")
         return trouble
@@ -217,6 +227,9 @@ BRIDGE_DIAMETERS = 3.0
 
 TOO_THIN, TOO_WIDE = 0.6, 1.5
 """Between these, in diameters, a rope may look wide: lost edges and coarse pixels make it thinner, noise wider."""
+
+_KINK = np.radians(100)
+"""No rope turns by more than this from one slice to the next."""
 
 _FEW = 20
 """Fewer points than this make no rope, however they lie."""
