@@ -320,15 +320,10 @@ class RopeConfig:
         ConfigError
             If the file cannot be read, is not TOML, or holds an unknown or impossible setting.
         """
-        try:
-            table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-        except (ValueError, RecursionError) as error:
-            raise ConfigError(f"{path}: not a TOML file: {error}") from None
+        table = read_toml(path)
         table |= {name: value for name, value in overrides.items() if value is not None}
         try:
-            return _from_table(cls, table, "")
+            return from_table(cls, table, "")
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from None
 
@@ -376,8 +371,30 @@ def _toml_value(value: Any) -> str:
     return repr(int(value) if isinstance(value, Integral) else float(value))
 
 
-def _from_table(cls: type[Any], table: dict[str, Any], where: str) -> Any:
-    """A config dataclass from a TOML table, with every key and type checked."""
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """The table that a TOML file holds.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or is not TOML.
+    """
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not a TOML file: {error}") from None
+
+
+def from_table(cls: type[Any], table: dict[str, Any], where: str = "") -> Any:
+    """A dataclass of settings from a TOML table, with every key and type checked.
+
+    Raises
+    ------
+    ConfigError
+        If a key is unknown or missing, or a value is of the wrong type or impossible; it names the key.
+    """
     known = {item.name: item for item in dataclasses.fields(cls)}
     hints = typing.get_type_hints(cls)
     values: dict[str, Any] = {}
@@ -388,7 +405,7 @@ def _from_table(cls: type[Any], table: dict[str, Any], where: str) -> Any:
         if dataclasses.is_dataclass(hint):
             if not isinstance(value, dict):
                 raise ConfigError(f"{where}{key} is a table: write [{where}{key}]")
-            values[key] = _from_table(typing.cast(type[Any], hint), value, f"{where}{key}.")
+            values[key] = from_table(typing.cast(type[Any], hint), value, f"{where}{key}.")
         else:
             values[key] = _converted(value, hint, known[key].metadata.get("unit") == "length", where + key)
     missing = [
@@ -428,6 +445,10 @@ def _converted(value: Any, hint: Any, is_length: bool, name: str) -> Any:
             if value in arguments:
                 return value
             raise ConfigError(f"{name} = {value!r}: expected one of {', '.join(map(repr, arguments))}")
+        if origin is tuple and arguments[1:] == (Ellipsis,):
+            if isinstance(value, (list, tuple)):
+                return tuple(_converted(item, arguments[0], is_length, name) for item in value)
+            raise ConfigError(f"{name} = {value!r}: expected a list in brackets")
         if origin is tuple:
             if isinstance(value, (list, tuple)) and len(value) == len(arguments):
                 return tuple(
