@@ -31,6 +31,12 @@ _RIM = 0.95
 _WIDE = 1.5
 """A slice whose variance across the rope exceeds that of a tube of its diameter this much is no single tube."""
 
+_SKEWED = 7.0
+"""Three times what the skewness of sqrt(n) normal values is by chance: more is a tail."""
+
+_CUTS = 4
+"""How often a tail is cut off, at most."""
+
 _FEWEST_FOR_FIT = 8
 """Points that a slice must have for its profile to be fitted."""
 
@@ -243,7 +249,7 @@ def _variance(covariance: Any, direction: Any) -> float:
     return max(total, 0.0)
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True)
 def _profile(
     points: Any,
     start: int,
@@ -259,39 +265,31 @@ def _profile(
 ) -> Any:
     """Where the axis lies from a slice's centroid: away from the camera, and to the side, metres.
 
-    With u and w a point's coordinates to the side and away, and s = sqrt(r^2 - u^2), the axis is w + s away; if it
-    lies u0 to the side, that is w + s + u0 u/s. The least-squares u0 is shrunk by the variance that it has.
+    With u and w a point's coordinates to the side and away, and s = sqrt(r^2 - u^2), the axis is q = w + s away; if it
+    lies u0 to the side, that is w + s + u0 u/s. The least-squares u0 is shrunk by the variance that it has. Where q has
+    a long tail to the far side, the rope is waisted there, as between the links of a chain: the tail is cut off.
     """
     seen = min(np.sqrt(3 * across) / radius, 1.0)
     mean_depth = radius * (0.5 * (np.sqrt(1 - seen * seen) + np.arcsin(seen) / seen) if seen > 1e-3 else 1.0)
     if stop - start < _FEWEST_FOR_FIT or across > _WIDE * radius * radius / 3:
         # More than one strand, or a blob: no round profile to fit.
         return mean_depth, 0.0
-    x, y, z = points
-    cx, cy, cz = c[0], c[1], c[2]
-    tx, ty, tz = t[0], t[1], t[2]
-    sx, sy, sz = side[0], side[1], side[2]
-    ax, ay, az = away[0], away[1], away[2]
-    bend_side = 0.5 * (bend[0] * sx + bend[1] * sy + bend[2] * sz)
-    bend_away = 0.5 * (bend[0] * ax + bend[1] * ay + bend[2] * az)
-    inside = (_RIM * radius) ** 2
-    n = sq = sg = sqg = sgg = sqq = 0.0
-    for i in range(np.uintp(start), np.uintp(stop)):
-        dx, dy, dz = x[i] - cx, y[i] - cy, z[i] - cz
-        v = tx * dx + ty * dy + tz * dz
-        curved = v * v - along
-        u = sx * dx + sy * dy + sz * dz - bend_side * curved
-        w = ax * dx + ay * dy + az * dz - bend_away * curved
-        near = 1.0 if u * u < inside else 0.0
-        s = np.sqrt(max(radius * radius - u * u, (1 - _RIM * _RIM) * radius * radius))
-        q = w + s
-        g = u / s
-        n += near
-        sq += near * q
-        sg += near * g
-        sqg += near * q * g
-        sgg += near * g * g
-        sqq += near * q * q
+    frame = (c[0], c[1], c[2], t[0], t[1], t[2], side[0], side[1], side[2], away[0], away[1], away[2])
+    bend_side = 0.5 * (bend[0] * side[0] + bend[1] * side[1] + bend[2] * side[2])
+    bend_away = 0.5 * (bend[0] * away[0] + bend[1] * away[1] + bend[2] * away[2])
+    curve = (bend_side, bend_away, along)
+    farthest = np.inf
+    n, sq, sqq, sqqq, sg, sgg, sqg = _profile_sums(points, start, stop, frame, curve, radius, mean_depth, farthest)
+    for _ in range(_CUTS):
+        if n < _FEWEST_FOR_FIT:
+            return mean_depth, 0.0
+        mean = sq / n
+        variance = max(sqq / n - mean * mean, 0.0)
+        third = sqqq / n - 3 * mean * sqq / n + 2 * mean**3
+        if third <= _SKEWED / np.sqrt(n) * variance**1.5:
+            break
+        farthest = mean_depth + mean + np.sqrt(variance)
+        n, sq, sqq, sqqq, sg, sgg, sqg = _profile_sums(points, start, stop, frame, curve, radius, mean_depth, farthest)
     if n < _FEWEST_FOR_FIT:
         return mean_depth, 0.0
     vgg = sgg - sg * sg / n
@@ -302,9 +300,40 @@ def _profile(
     scatter = max(vqq - vqg * vqg / vgg, 0.0) / (n - 2)
     pixel = 12 * np.sqrt(along * across) / (stop - start)
     # The pixels leave a quarter of their pitch open, as a standard deviation, and never more than half of it.
-    half = np.sqrt(pixel) / 2
-    shift = min(max(-vqg / (vgg + scatter / (pixel / 16 + 1e-18)), -half), half)
-    return (sq + shift * sg) / n, shift
+    limit = np.sqrt(pixel) / 2
+    shift = min(max(-vqg / (vgg + scatter / (pixel / 16 + 1e-18)), -limit), limit)
+    return mean_depth + (sq + shift * sg) / n, shift
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _profile_sums(
+    points: Any, start: int, stop: int, frame: Any, curve: Any, radius: float, origin: float, farthest: float
+) -> Any:
+    """Count, and sums of q, q^2, q^3, g, g^2 and q g with g = u/s; q is counted from the origin, and no farther than told."""
+    x, y, z = points
+    cx, cy, cz, tx, ty, tz, sx, sy, sz, ax, ay, az = frame
+    bend_side, bend_away, along = curve
+    inside = (_RIM * radius) ** 2
+    least = (1 - _RIM * _RIM) * radius * radius
+    n = sq = sqq = sqqq = sg = sgg = sqg = 0.0
+    for i in range(np.uintp(start), np.uintp(stop)):
+        dx, dy, dz = x[i] - cx, y[i] - cy, z[i] - cz
+        v = tx * dx + ty * dy + tz * dz
+        curved = v * v - along
+        u = sx * dx + sy * dy + sz * dz - bend_side * curved
+        s = np.sqrt(max(radius * radius - u * u, least))
+        q = ax * dx + ay * dy + az * dz - bend_away * curved + s
+        weight = 1.0 if (u * u < inside) & (q < farthest) else 0.0
+        q = weight * (q - origin)
+        g = weight * u / s
+        n += weight
+        sq += q
+        sqq += q * q
+        sqqq += q * q * q
+        sg += g
+        sgg += g * g
+        sqg += q * g
+    return n, sq, sqq, sqqq, sg, sgg, sqg
 
 
 @njit(cache=True, nogil=True)
