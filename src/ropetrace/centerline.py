@@ -19,6 +19,9 @@ _FINE_STEPS = 8
 MOST_SPACINGS = 100_000
 """More waypoints than these are not made: such a length is a wrong unit, and must not exhaust the memory."""
 
+SHORTEST_STEP = 1e-6
+"""Nodes closer together than this are one, metres."""
+
 _STEEP = 0.2
 """Sine of the angle between rope and view below which equation 16 is too ill-conditioned to be used."""
 
@@ -53,13 +56,14 @@ def extend_to_tips(chain: FloatArray, reach: tuple[float, float]) -> FloatArray:
     Returns
     -------
     (M + 2, 3) float array
+        Shorter by what does not reach on.
     """
     tangents = chain_tangents(chain)
-    extended = np.empty((len(chain) + 2, 3))
-    extended[1:-1] = chain
-    extended[0] = chain[0] - reach[0] * tangents[0]
-    extended[-1] = chain[-1] + reach[1] * tangents[-1]
-    return extended
+    first, last = chain[0] - reach[0] * tangents[0], chain[-1] + reach[1] * tangents[-1]
+    # A slice without extent, as of coincident points, has no tip beyond it.
+    before = [first] if reach[0] > SHORTEST_STEP else []
+    after = [last] if reach[1] > SHORTEST_STEP else []
+    return np.array([*before, *chain, *after])
 
 
 def sample_spline(chain: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -9,7 +9,9 @@ import dataclasses
 import difflib
 import json
 import math
+import os
 import re
+import stat
 import tomllib
 import types
 import typing
@@ -27,6 +29,8 @@ Vector = tuple[float, float, float]
 
 DIAMETER_RANGE = (0.0005, 0.5)
 """What a depth camera can track, metres: half a millimetre to half a metre."""
+
+_MOST_CONFIG_BYTES = 1_000_000
 
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 _LENGTH = {"unit": "length"}
@@ -167,8 +171,8 @@ class SlicingConfig:
                 "such as 1e-4",
             )
         _require(
-            self.min_points is None or self.min_points >= 1,
-            f"slicing.min_points = {self.min_points}: expected 1 or more",
+            self.min_points is None or 1 <= self.min_points <= 1_000_000,
+            f"slicing.min_points = {self.min_points}: expected 1 to 1 000 000",
         )
         _require(
             self.surface_offset is None or (_finite(*self.surface_offset) and max(map(abs, self.surface_offset)) < 1),
@@ -380,7 +384,13 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         If the file cannot be read or is not TOML.
     """
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise ConfigError(f"{path}: not a file")
+        with open(path, "rb") as file:
+            text = file.read(_MOST_CONFIG_BYTES + 1)
+        if len(text) > _MOST_CONFIG_BYTES:
+            raise ConfigError(f"{path}: larger than {_MOST_CONFIG_BYTES} bytes: not a file of settings")
+        return tomllib.loads(text.decode("utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:

@@ -37,8 +37,8 @@ SEARCH_BUDGET = 250_000
 _OVERLAP = 1.5
 """Strands whose axes come closer in the view than this, in diameters, may share slices."""
 
-_NEIGHBOURHOOD = 3.0
-"""Stretches of a chain closer than this along it, in diameters, are neighbours and may touch."""
+_GONE = 2.5
+"""A strand that has been this far from another in the view, in diameters, comes back if it overlaps it later."""
 
 _MOST_PIECES = 8
 """Pieces that the chain is cut into at once: the time grows with 4^n."""
@@ -200,20 +200,18 @@ def _strands_overlap(chain: Any, diameter: float) -> bool:
     count = len(chain)
     views = np.empty((count, 3))
     ranges = np.empty(count)
-    length = np.zeros(count)
     for i in range(count):
         ranges[i] = max(np.sqrt(np.sum(chain[i] ** 2)), 1e-9)
         views[i] = chain[i] / ranges[i]
-        if i:
-            length[i] = length[i - 1] + np.sqrt(np.sum((chain[i] - chain[i - 1]) ** 2))
     for i in range(count - 1):
+        gone = False
         for j in range(i + 2, count - 1):
-            # A hairpin as tight as a rope can be brings stretches that are this far apart side by side.
-            if length[j] - length[i + 1] < _NEIGHBOURHOOD * diameter:
-                continue
             near = min(ranges[i], ranges[i + 1], ranges[j], ranges[j + 1])
-            if _segment_distance(views[i], views[i + 1], views[j], views[j + 1]) * near < _OVERLAP * diameter:
+            apart = _segment_distance(views[i], views[i + 1], views[j], views[j + 1]) * near
+            # A rope that leads away from the camera stays close to itself in the view without overlapping.
+            if gone and apart < _OVERLAP * diameter:
                 return True
+            gone = gone or apart > _GONE * diameter
     return False
 
 

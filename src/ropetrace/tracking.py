@@ -170,8 +170,6 @@ def _moved(points: FloatArray, transform: FloatArray) -> FloatArray:
 
 
 def _estimate(event: Event, tracker: Tracker, watch: _Stopwatch) -> Estimate:
-    if isinstance(event, BadFrame):
-        return Estimate.lost(event.stamp_ns, event.reason)
     try:
         return tracker.update(event, watch.lap)
     except FrameError as error:

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ropetrace.types import Cloud, Estimate, Frame
+from ropetrace.types import BadFrame, Cloud, Estimate, Frame
 
 Mask = NDArray[np.bool_] | Callable[[Frame], NDArray[np.bool_]]
 """True where the rope is: (H, W) for an image, (N,) for a cloud; or a function that makes one of a frame."""
@@ -24,12 +24,12 @@ def no_lap(stage: str) -> None:
 class Tracker(Protocol):
     """Turns frames into estimates. It knows nothing of files, viewers or clocks."""
 
-    def update(self, frame: Frame, lap: Lap = no_lap) -> Estimate:
-        """The estimate of one frame.
+    def update(self, frame: Frame | BadFrame, lap: Lap = no_lap) -> Estimate:
+        """The estimate of one frame; of a bad frame, that it is lost.
 
         Parameters
         ----------
-        frame : RgbdFrame or CloudFrame
+        frame : RgbdFrame, CloudFrame or BadFrame
             The next frame.
         lap : callable
             Told of the end of each stage.

@@ -5,10 +5,12 @@ Rastegarpanah, Howard and Stolkin, "Tracking linear deformable objects using sli
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ropetrace.centerline import chain_tangents, extend_to_tips, make_waypoints
+from ropetrace.centerline import SHORTEST_STEP, chain_tangents, extend_to_tips, make_waypoints
 from ropetrace.config import RopeConfig, SegmentationConfig, parse_color
 from ropetrace.errors import FrameError
 from ropetrace.ordering import (
@@ -23,7 +25,7 @@ from ropetrace.ordering import (
 from ropetrace.segmentation import ColorGate, PositionBox, Segmenter
 from ropetrace.slicing import Slicer, Slices, axis_points
 from ropetrace.trackers.base import Lap, Mask, no_lap
-from ropetrace.types import Cloud, CloudFrame, Estimate, FloatArray, Frame, RgbdFrame, Status, Waypoints
+from ropetrace.types import BadFrame, Cloud, CloudFrame, Estimate, FloatArray, Frame, RgbdFrame, Status, Waypoints
 
 
 class SlicingTracker:
@@ -56,19 +58,23 @@ class SlicingTracker:
         self._chain: FloatArray | None = None
         self._waypoints: Waypoints | None = None
         self._stamp_ns: int | None = None
+        self._lengths: deque[float] = deque(maxlen=_LATELY)
         self._points: FloatArray = np.empty((3, 0))
         self._slices: Slices | None = None
         if self.config.segmentation.color_pixel is not None:
             self._segmenter.gate = None
 
-    def update(self, frame: Frame, lap: Lap = no_lap) -> Estimate:
-        """The estimate of one frame.
+    def update(self, frame: Frame | BadFrame, lap: Lap = no_lap) -> Estimate:
+        """The estimate of one frame; of a bad frame, that it is lost.
 
         Raises
         ------
         FrameError
             If colour is asked for and the frame has none, or the mask does not fit the frame.
         """
+        if isinstance(frame, BadFrame):
+            self._points, self._slices = np.empty((3, 0)), None
+            return Estimate.lost(frame.stamp_ns, frame.reason)
         reasons = self._stamp_trouble(frame.stamp_ns)
         self._points, self._slices = np.empty((3, 0)), None
 
@@ -77,7 +83,7 @@ class SlicingTracker:
         if count == 0:
             return Estimate.lost(frame.stamp_ns, "no points of the rope's colour and place")
         if stride > 1:
-            reasons.append(f"{count} points passed, every {stride}th is used: narrow the colour or the position box")
+            reasons.append(f"{count} points passed, one in {stride} is used: narrow the colour or the position box")
 
         slices = self._slicer.slice(points)
         lap("slicing")
@@ -91,6 +97,7 @@ class SlicingTracker:
         slices, trouble = self._in_order(slices)
         reasons += trouble
         lap("ordering")
+        slices = slices.kept(_distinct(slices.centroids))
         if len(slices) < 2:
             return Estimate.lost(frame.stamp_ns, _scattered(points.shape[1]), count)
 
@@ -102,6 +109,7 @@ class SlicingTracker:
         waypoints = make_waypoints(chain, self.config.centerline.spacing, self._waypoints)
         lap("centerline")
 
+        reasons += self._length_trouble(waypoints.length)
         self._slices, self._chain, self._waypoints = slices, slices.centroids, waypoints
         status = Status.DEGRADED if reasons else Status.OK
         return Estimate(frame.stamp_ns, status, tuple(reasons), nodes, waypoints, count, stride)
@@ -116,7 +124,11 @@ class SlicingTracker:
 
     def _stamp_trouble(self, stamp_ns: int) -> list[str]:
         previous, self._stamp_ns = self._stamp_ns, stamp_ns
-        if previous is None or stamp_ns > previous:
+        if previous is None:
+            return []
+        if stamp_ns - previous > _LEAP_SECONDS * 1e9:
+            return [f"the stamp leaps ahead by {(stamp_ns - previous) / 1e9:.0f} s"]
+        if stamp_ns > previous:
             return []
         if stamp_ns == previous:
             return ["the stamp repeats that of the frame before"]
@@ -202,6 +214,8 @@ class SlicingTracker:
             )
         elif np.count_nonzero(widths > 2 * diameter) > 0.1 * len(widths):
             trouble.append("parts are far wider than the rope: a hand, a knot or a branch is taken for rope")
+        if len(nodes) < _FEW_SLICES:
+            trouble.append(f"only {len(nodes)} slices: too short for a rope, or the diameter is too large")
         if strands_overlap(nodes, diameter):
             trouble.append("strands overlap in the camera's view: the order there may be wrong")
         elif sharpest_turn(nodes) > _KINK:
@@ -209,6 +223,13 @@ class SlicingTracker:
         if np.median(nodes[:, 2]) > _FARTHEST:
             trouble.append(f"the points are {np.median(nodes[:, 2]):.0f} m away: is the recording in millimetres?")
         return trouble
+
+    def _length_trouble(self, length: float) -> list[str]:
+        usual = float(np.median(self._lengths)) if self._lengths else length
+        self._lengths.append(length)
+        if abs(length - usual) <= _LENGTH_CHANGE * usual:
+            return []
+        return [f"the length is {length:.3f} m and was {usual:.3f} m lately: a part is hidden, or something is added"]
 
     def _runs_backwards(self, chain: FloatArray) -> bool:
         ordering = self.config.ordering
@@ -230,6 +251,18 @@ TOO_THIN, TOO_WIDE = 0.6, 1.5
 
 _KINK = np.radians(100)
 """No rope turns by more than this from one slice to the next."""
+
+_FEW_SLICES = 5
+"""Fewer slices than this are no rope's shape: a ball has as many."""
+
+_LENGTH_CHANGE = 0.15
+"""A rope whose length differs by more than this share from what it was lately is partly hidden, or not alone."""
+
+_LATELY = 31
+"""Frames whose lengths are remembered."""
+
+_LEAP_SECONDS = 60.0
+"""No camera pauses for longer between two frames of one recording."""
 
 _FEW = 20
 """Fewer points than this make no rope, however they lie."""
@@ -258,6 +291,12 @@ def _reach(slices: Slices, tangents: FloatArray) -> tuple[float, float]:
     first = tangents[0] @ slices.covariances[0] @ tangents[0]
     last = tangents[-1] @ slices.covariances[-1] @ tangents[-1]
     return float(np.sqrt(3 * max(first, 0.0))), float(np.sqrt(3 * max(last, 0.0)))
+
+
+def _distinct(chain: FloatArray) -> NDArray[np.bool_]:
+    """Which nodes of a chain do not coincide with the one before."""
+    steps = np.diff(chain, axis=0)
+    return np.concatenate([[True], np.einsum("ij,ij->i", steps, steps) > SHORTEST_STEP**2])
 
 
 def _too_little(points: int, slices: int) -> str:
