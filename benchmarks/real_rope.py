@@ -19,6 +19,8 @@ DATA = Path(os.environ.get("ROPETRACE_DATA", Path(__file__).parents[2] / "shared
 
 
 def main() -> None:
+    if not DATA.is_dir():
+        raise SystemExit(f"no recorded data in {DATA}: set ROPETRACE_DATA to their folder")
     tracker = make_tracker(RopeConfig(diameter=0.006))
     print("frame  status  points  nodes  length_m  mean_mm  p95_mm  moved_start_mm  moved_end_mm")
     before: np.ndarray | None = None

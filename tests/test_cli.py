@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -70,14 +71,15 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp
 
     def call(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["ropetrace", *map(str, arguments)])
-        before = signal.getsignal(signal.SIGTERM)
+        before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
             cli.main()
             code: object = 0
         except SystemExit as error:
             code = error.code
         finally:
-            signal.signal(signal.SIGTERM, before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
         out, err = capsys.readouterr()
         assert "Traceback" not in out + err
         return int(code) if isinstance(code, int) else 1, out, err
@@ -189,6 +191,10 @@ def test_a_mask_replaces_the_colour(run: Run, tmp_path: Path) -> None:
         (["track", "{folder}", "-d", "6mm", "--out", "no/such/place.csv"], ["no/such"]),
         (["track", "{folder}", "-d", "6mm", "--start", "-1"], ["--start"]),
         (["track", "{folder}", "-d", "6mm", "--limit", "0"], ["--limit"]),
+        (["track", "{folder}", "-d", "6mm", "--start", "9" * 20], ["--start"]),
+        (["track", "{folder}", "-d", "6mm", "--config", "/dev/zero"], ["/dev/zero", "not a file"]),
+        (["track", "{folder}", "-d", "6mm", "--mask", "/dev/zero"], ["/dev/zero"]),
+        (["doctor", "{folder}", "-d", "6mm", "--frames", "0"], ["--frames"]),
         (["track", "{folder}", "-d", "6mm", "--frame", "world"], ["camera_pose"]),
         (["track", "{folder}", "-d", "6mm", "--mask", "nowhere.png"], ["nowhere.png"]),
         (["track", "{folder}", "-d", "6mm", "--config", "nowhere.toml"], ["nowhere.toml"]),
@@ -224,6 +230,70 @@ def test_existing_results_are_kept(run: Run, folder: Path, tmp_path: Path) -> No
     assert "--overwrite" in err
     assert (tmp_path / "r.csv").read_text() == "precious"
     assert run("track", folder, "-d", "24mm", "-c", COLOR, "--out", "r.csv", "--overwrite")[0] == 0
+
+
+def test_no_output_may_be_the_input(run: Run, tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "rope.mcap", rope_frames(3))
+    whole = path.read_bytes()
+    (tmp_path / "link.mcap").hardlink_to(path)
+    for name in ("rope.mcap", "./rope.mcap", "link.mcap"):
+        code, _, err = run("track", path, "-d", "24mm", "-c", COLOR, "--out", name, "--overwrite")
+        assert code == cli.BAD_INPUT
+        assert "input" in err
+    assert path.read_bytes() == whole
+
+
+def test_an_output_in_the_recordings_folder_replaces_nothing(run: Run, folder: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(folder, tmp_path / "rope")
+    (copy / "notes.csv").write_text("precious")
+    assert run("track", copy, "-d", "24mm", "-c", COLOR, "--out", copy / "notes.csv", "--overwrite")[0] == cli.BAD_INPUT
+    assert (copy / "notes.csv").read_text() == "precious"
+
+
+def test_outputs_are_checked_before_any_is_made(run: Run, folder: Path, tmp_path: Path) -> None:
+    for second in ("bad.xyz", "r.csv", "./r.csv", "no/place.csv"):
+        assert run("track", folder, "-d", "24mm", "-c", COLOR, "--out", "r.csv", second)[0] == cli.BAD_INPUT
+        assert not (tmp_path / "r.csv").exists()
+    (tmp_path / "r.csv.toml").write_text("precious")
+    assert run("track", folder, "-d", "24mm", "-c", COLOR, "--out", "r.csv")[0] == cli.BAD_INPUT
+    assert (tmp_path / "r.csv.toml").read_text() == "precious"
+
+
+def test_the_doctor_keeps_pictures_that_exist(run: Run, folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.png").write_text("precious")
+    assert run("doctor", folder, "-d", "24mm", "-c", COLOR, "--picture", "mine.png")[0] == cli.BAD_INPUT
+    assert (tmp_path / "mine.png").read_text() == "precious"
+
+
+def test_a_start_beyond_the_end_is_told(run: Run, folder: Path) -> None:
+    code, _, err = run("track", folder, "-d", "24mm", "-c", COLOR, "--start", 50)
+    assert code == cli.NOTHING_FOUND
+    assert "--start 50" in err
+
+
+def test_names_that_the_terminal_cannot_show(folder: Path, tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "ropetrace",
+        "track",
+        str(folder),
+        "-d",
+        "24mm",
+        "-c",
+        COLOR,
+        "-o",
+        "r\u00f6pe.csv",
+    ]
+    done = subprocess.run(
+        command,
+        cwd=tmp_path,
+        capture_output=True,
+        check=False,
+        env={**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "r\u00f6pe.csv").exists()
 
 
 def test_no_colour_where_a_colour_is_asked_for(run: Run, tmp_path: Path) -> None:

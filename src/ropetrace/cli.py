@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import signal
 import sys
 import time
@@ -21,8 +22,13 @@ if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
     from ropetrace.recordings import Recording
 
+_MOST_FRAMES = 10**12
+
 BAD_INPUT, NOTHING_FOUND, DAMAGED, INTERRUPTED = 2, 1, 3, 130
 """Exit codes: what was given is wrong; no frame gave an estimate; part of the recording was lost; Ctrl-C."""
+
+
+_DOCTOR_PICTURE = Path("ropetrace-doctor.png")
 
 
 @dataclass(frozen=True)
@@ -49,10 +55,10 @@ class Source:
         """Open the recording."""
         from ropetrace.recordings import open_recording
 
-        if self.start < 0:
-            raise ConfigError(f"--start {self.start}: expected 0 or more")
-        if self.limit is not None and self.limit < 1:
-            raise ConfigError(f"--limit {self.limit}: expected 1 or more")
+        if not 0 <= self.start <= _MOST_FRAMES:
+            raise ConfigError(f"--start {self.start}: expected 0 to {_MOST_FRAMES}")
+        if self.limit is not None and not 1 <= self.limit <= _MOST_FRAMES:
+            raise ConfigError(f"--limit {self.limit}: expected 1 to {_MOST_FRAMES}")
         return open_recording(
             self.recording,
             rate=self.rate,
@@ -163,6 +169,7 @@ class Track:
             frame=self.frame,
             view=self.view,
             overwrite=self.overwrite,
+            inputs=[path for path in (self.rope.config, self.mask) if path is not None],
         )
 
 
@@ -211,15 +218,21 @@ class Doctor:
 
     source: OmitArgPrefixes[Source]
     rope: OmitArgPrefixes[Rope]
-    picture: Path = Path("ropetrace-doctor.png")
+    picture: Path = _DOCTOR_PICTURE
     """Where to put the picture of what the gate keeps."""
     frames: int = 20
     """How many frames to look at, spread over the recording."""
+    overwrite: bool = False
+    """Replace a picture that exists; the default one is always replaced."""
 
     def run(self) -> int:
         from ropetrace.doctor import diagnose
         from ropetrace.picture import save_picture
 
+        if not 1 <= self.frames <= 10_000:
+            raise ConfigError(f"--frames {self.frames}: expected 1 to 10000")
+        if self.picture.exists() and self.picture != _DOCTOR_PICTURE and not self.overwrite:
+            raise OutputError(f"{self.picture} exists already: choose another name or give --overwrite")
         config = self.rope.settings()
         recording = self.source.open()
         diagnosis = diagnose(_spread(recording, self.source, self.frames), config, recording.info())
@@ -241,9 +254,15 @@ def main() -> None:
         | Annotated[Info, tyro.conf.subcommand("info")]
         | Annotated[Doctor, tyro.conf.subcommand("doctor")],  # type: ignore[arg-type]
         prog="ropetrace",
-        description="The 3-D shape of a rope, cable or hose from the recordings of an RGB-D camera.",
+        description="The 3-D shape of a rope, cable or hose from the recordings of an RGB-D camera. "
+        "`ropetrace --version` tells the version.",
     )
+    for stream in (sys.stdout, sys.stderr):
+        # A name that the terminal cannot show must not end a run that is done.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     signal.signal(signal.SIGTERM, _interrupt)
+    signal.signal(signal.SIGINT, _interrupt)
     try:
         code = command.run()
     except RopetraceError as error:
@@ -259,7 +278,12 @@ def main() -> None:
     sys.exit(code)
 
 
+_INTERRUPTS: list[int] = []
+"""Signals that came. The exception alone is not enough: raised inside the compiler's callbacks it is swallowed."""
+
+
 def _interrupt(number: int, frame: object) -> None:
+    _INTERRUPTS.append(number)
     raise KeyboardInterrupt
 
 
@@ -276,9 +300,10 @@ def _track(
     view: bool = False,
     overwrite: bool = False,
     extra_sinks: list[Any] | None = None,
+    inputs: list[Path] | None = None,
 ) -> int:
     from ropetrace.picture import ContactSheet
-    from ropetrace.results import open_writer
+    from ropetrace.results import check_outputs, open_writer
     from ropetrace.trackers import make_tracker
     from ropetrace.tracking import track_recording
 
@@ -286,8 +311,11 @@ def _track(
         raise ConfigError("--frame world needs camera_pose in the config")
     if picture is not None and frame == "world":
         raise ConfigError("--picture draws in the camera's frame: leave out --frame world")
-    if picture is not None and picture.exists() and not overwrite:
-        raise OutputError(f"{picture} exists already: choose another name or give --overwrite")
+    sources = [recording.path, *(inputs or [])]
+    check_outputs(outputs, overwrite, sources)
+    for path in [_settings_of(path) for path in outputs] + ([] if picture is None else [picture]):
+        if path.exists() and (not overwrite or any(path.samefile(source) for source in sources)):
+            raise OutputError(f"{path} exists already: choose another name or give --overwrite")
     if config.asks_for_color and mask is None and not _has_color(recording, start):
         raise ConfigError("a colour is asked for, but the recording has none: leave out the colour, or record it")
     tracker = make_tracker(config, None if mask is None else _mask(mask))
@@ -304,7 +332,7 @@ def _track(
             for path in outputs
         ]
         for path in outputs:
-            _write_config(path.with_name(path.name + ".toml"), resolved)
+            _write_config(_settings_of(path), resolved)
         viewer = None
         if view:
             from ropetrace.results.live import LiveViewer
@@ -326,6 +354,7 @@ def _track(
                 world_from_camera=pose,
                 wants_cloud=view or any(path.suffix.lower() == ".rrd" for path in outputs),
                 on_frame=lambda estimate: advance(str(estimate.status)),
+                should_stop=lambda: bool(_INTERRUPTS),
             )
     if contact is not None:
         contact.save()
@@ -342,6 +371,9 @@ def _track(
     if recording.problems:
         print("ropetrace: part of the recording was lost (see damage above)", file=sys.stderr)
         return DAMAGED
+    if not summary.frames:
+        print(f"ropetrace: there is no frame at or after --start {start}", file=sys.stderr)
+        return NOTHING_FOUND
     if not summary.found:
         print(
             "ropetrace: no frame gave an estimate; `ropetrace doctor` with the same arguments says why",
@@ -375,6 +407,11 @@ def _has_color(recording: Recording, start: int) -> bool:
     return True
 
 
+def _settings_of(path: Path) -> Path:
+    """Where the settings of a result are kept."""
+    return path.with_name(path.name + ".toml")
+
+
 def _write_config(path: Path, text: str) -> None:
     try:
         path.write_text(f"# ropetrace {version('ropetrace')}, {time.strftime('%Y-%m-%d')}\n{text}", encoding="utf-8")
@@ -387,9 +424,11 @@ def _mask(path: Path) -> Any:
     from PIL import Image
 
     try:
+        if not path.is_file():
+            raise OSError("not a file")
         with Image.open(path) as image:
             return np.asarray(image.convert("L")) > 127
-    except OSError as error:
+    except (OSError, Image.DecompressionBombError) as error:
         raise ConfigError(f"--mask {path}: cannot be read as an image: {error}") from None
 
 

@@ -309,7 +309,7 @@ def _profile(
 def _profile_sums(
     points: Any, start: int, stop: int, frame: Any, curve: Any, radius: float, origin: float, farthest: float
 ) -> Any:
-    """Count, and sums of q, q^2, q^3, g, g^2 and q g with g = u/s; q is counted from the origin, and no farther than told."""
+    """Count, and sums of q, q^2, q^3, g, g^2 and q g, g = u/s; q counts from the origin, and no farther than told."""
     x, y, z = points
     cx, cy, cz, tx, ty, tz, sx, sy, sz, ax, ay, az = frame
     bend_side, bend_away, along = curve

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import cast
 
 from ropetrace.errors import OutputError
-from ropetrace.results.base import ResultWriter
+from ropetrace.results.base import ResultWriter, check_place
 from ropetrace.types import FloatArray
 
-__all__ = ["FORMATS", "ResultWriter", "open_writer"]
+__all__ = ["FORMATS", "ResultWriter", "check_outputs", "open_writer"]
 
 FORMATS = MappingProxyType(
     {
@@ -26,6 +26,43 @@ FORMATS = MappingProxyType(
 """The endings that `open_writer` takes, each with the class that writes it."""
 
 NO_METADATA: Mapping[str, str] = MappingProxyType({})
+
+
+def check_outputs(paths: Sequence[Path], overwrite: bool, inputs: Sequence[Path] = ()) -> None:
+    """Refuse what `open_writer` would refuse, before any of several files is made.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Where results will be written.
+    overwrite : bool
+        Whether files that are there already may be replaced.
+    inputs : sequence of Path
+        What is being read, files or folders: no output may be one of them or lie inside one, whatever `overwrite` says.
+
+    Raises
+    ------
+    OutputError
+        The message names the path.
+    """
+    places = [path.resolve() for path in paths]
+    for path, place in zip(paths, places, strict=True):
+        _check_ending(path)
+        check_place(path)
+        if places.count(place) > 1:
+            raise OutputError(f"{path} is given twice as an output")
+        if not path.exists():
+            continue
+        for source in inputs:
+            if source.exists() and (path.samefile(source) or (source.is_dir() and source.resolve() in place.parents)):
+                raise OutputError(f"{path} is, or belongs to, the input {source}: choose another name")
+        if not overwrite:
+            raise OutputError(f"{path} exists already: choose another name or give --overwrite")
+
+
+def _check_ending(path: Path) -> None:
+    if path.suffix.lower() not in FORMATS:
+        raise OutputError(f"{path}: cannot tell the format from the ending {path.suffix!r}: use {', '.join(FORMATS)}")
 
 
 def open_writer(
@@ -59,8 +96,7 @@ def open_writer(
         If the format needs an extra that is not installed.
     """
     path = Path(path)
-    if path.suffix.lower() not in FORMATS:
-        raise OutputError(f"{path}: cannot tell the format from the ending {path.suffix!r}: use {', '.join(FORMATS)}")
+    _check_ending(path)
     module, name = FORMATS[path.suffix.lower()]
     writer = getattr(importlib.import_module(module), name)
     extra = {"frame_from_camera": frame_from_camera} if path.suffix.lower() == ".rrd" else {}

@@ -109,7 +109,7 @@ class SlicingTracker:
         waypoints = make_waypoints(chain, self.config.centerline.spacing, self._waypoints)
         lap("centerline")
 
-        reasons += self._length_trouble(waypoints.length)
+        reasons += self._length_trouble(waypoints.length, sound=not reasons)
         self._slices, self._chain, self._waypoints = slices, slices.centroids, waypoints
         status = Status.DEGRADED if reasons else Status.OK
         return Estimate(frame.stamp_ns, status, tuple(reasons), nodes, waypoints, count, stride)
@@ -224,9 +224,11 @@ class SlicingTracker:
             trouble.append(f"the points are {np.median(nodes[:, 2]):.0f} m away: is the recording in millimetres?")
         return trouble
 
-    def _length_trouble(self, length: float) -> list[str]:
+    def _length_trouble(self, length: float, sound: bool) -> list[str]:
+        """Whether the length is not what it was lately, in the frames that had nothing else wrong with them."""
         usual = float(np.median(self._lengths)) if self._lengths else length
-        self._lengths.append(length)
+        if sound:
+            self._lengths.append(length)
         if abs(length - usual) <= _LENGTH_CHANGE * usual:
             return []
         return [f"the length is {length:.3f} m and was {usual:.3f} m lately: a part is hidden, or something is added"]

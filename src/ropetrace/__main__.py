@@ -1,0 +1,5 @@
+"""``python -m ropetrace``."""
+
+from ropetrace.cli import main
+
+main()
