@@ -196,7 +196,7 @@ def main() -> None:
     parser.add_argument("--largest", type=int, default=1_000_000, help="largest cloud")
     parser.add_argument("--same", action="store_true", help="one frame over and over, which stays in the cache")
     options = parser.parse_args()
-    import_extra("matplotlib", "dev")
+    import_extra("matplotlib", "sim")
     frames = make_frames(40)
     timed = frames[:1] if options.same else frames
     boxed = RopeConfig(2 * RADIUS, "#c8281e", segmentation=BOX)
