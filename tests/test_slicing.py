@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers import SMALL, random_rotation, rope_cloud, same_set, seen, straight
+from ropetrace.axis import axis_points
 from ropetrace.config import default_variance_threshold
-from ropetrace.slicing import Slicer, Slices, axis_points
-from ropetrace.types import FloatArray
+from ropetrace.slicing import Slicer
+from ropetrace.types import FloatArray, Slices
 
 THRESHOLD = default_variance_threshold(0.012)
 seeds = st.integers(0, 2**32 - 1)

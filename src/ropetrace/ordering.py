@@ -34,12 +34,6 @@ _LONGEST_MOVE = 3
 SEARCH_BUDGET = 250_000
 """Changes of the order that are looked at in one frame, at most: some ten milliseconds."""
 
-_OVERLAP = 1.5
-"""Strands whose axes come closer in the view than this, in diameters, may share slices."""
-
-_GONE = 2.5
-"""A strand that has been this far from another in the view, in diameters, comes back if it overlaps it later."""
-
 _MOST_PIECES = 8
 """Pieces that the chain is cut into at once: the time grows with 4^n."""
 
@@ -161,26 +155,6 @@ def end_scores(centroids: FloatArray, first_point: tuple[float, float, float] | 
     return np.asarray(spread - np.linalg.norm(centroids - np.array(first_point), axis=1))
 
 
-def strands_overlap(chain: FloatArray, diameter: float) -> bool:
-    """Whether two stretches of a chain that are not neighbours overlap in the camera's view, or nearly.
-
-    There the slices of both run into each other, and the way through is a guess.
-
-    Parameters
-    ----------
-    chain : (M, 3) float array
-        Nodes on the axis in order, metres, camera frame.
-    diameter : float
-        Of the rope, metres.
-    """
-    return bool(_strands_overlap(chain, diameter))
-
-
-def sharpest_turn(chain: FloatArray) -> float:
-    """The largest turn at a node of a chain, radians; 0 for fewer than three nodes."""
-    return float(_sharpest_turn(chain))
-
-
 def runs_backwards(chain: FloatArray, previous: FloatArray) -> bool:
     """Whether a chain runs from the previous chain's end to its start.
 
@@ -193,63 +167,6 @@ def runs_backwards(chain: FloatArray, previous: FloatArray) -> bool:
         Nodes in order, metres.
     """
     return bool(_runs_backwards(chain, previous))
-
-
-@njit(cache=True, nogil=True)
-def _strands_overlap(chain: Any, diameter: float) -> bool:
-    count = len(chain)
-    views = np.empty((count, 3))
-    ranges = np.empty(count)
-    for i in range(count):
-        ranges[i] = max(np.sqrt(np.sum(chain[i] ** 2)), 1e-9)
-        views[i] = chain[i] / ranges[i]
-    for i in range(count - 1):
-        gone = False
-        for j in range(i + 2, count - 1):
-            near = min(ranges[i], ranges[i + 1], ranges[j], ranges[j + 1])
-            apart = _segment_distance(views[i], views[i + 1], views[j], views[j + 1]) * near
-            # A rope that leads away from the camera stays close to itself in the view without overlapping.
-            if gone and apart < _OVERLAP * diameter:
-                return True
-            gone = gone or apart > _GONE * diameter
-    return False
-
-
-@njit(cache=True, nogil=True)
-def _sharpest_turn(chain: Any) -> float:
-    least = 1.0
-    for i in range(1, len(chain) - 1):
-        before = after = product = 0.0
-        for k in range(3):
-            u, v = chain[i, k] - chain[i - 1, k], chain[i + 1, k] - chain[i, k]
-            before += u * u
-            after += v * v
-            product += u * v
-        least = min(least, product / max(np.sqrt(before * after), 1e-300))
-    return np.arccos(max(least, -1.0))
-
-
-@njit(cache=True, nogil=True)
-def _segment_distance(a: Any, b: Any, c: Any, d: Any) -> float:
-    """Least distance of two stretches ab and cd in space (Ericson, Real-Time Collision Detection, 2005, 5.1.9)."""
-    uu = vv = uv = uw = vw = 0.0
-    for k in range(3):
-        u, v, w = b[k] - a[k], d[k] - c[k], a[k] - c[k]
-        uu += u * u
-        vv += v * v
-        uv += u * v
-        uw += u * w
-        vw += v * w
-    across = uu * vv - uv * uv
-    s = min(max((uv * vw - uw * vv) / across, 0.0), 1.0) if across > 1e-12 * uu * vv else 0.0
-    t = (uv * s + vw) / vv if vv > 0 else 0.0
-    if t < 0.0 or t > 1.0 or vv == 0.0:
-        t = min(max(t, 0.0), 1.0)
-        s = min(max((uv * t - uw) / uu, 0.0), 1.0) if uu > 0 else 0.0
-    total = 0.0
-    for k in range(3):
-        total += (a[k] + s * (b[k] - a[k]) - c[k] - t * (d[k] - c[k])) ** 2
-    return np.sqrt(total)
 
 
 @njit(cache=True, nogil=True)

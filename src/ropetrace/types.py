@@ -285,6 +285,44 @@ class Cloud:
             raise ValueError(f"cloud: shapes {self.points.shape}, {self.node.shape} do not fit")
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Slices:
+    """The parts of a cloud, in no particular order.
+
+    Parameters
+    ----------
+    centroids : (M, 3) float array
+        Mean of each part's points, metres (equation 2).
+    covariances : (M, 3, 3) float array
+        Covariance of each part's points, divided by their count, m^2 (equation 3 takes its trace).
+    counts : (M,) int array
+        Points of each part.
+    capped : bool
+        Whether the cap on parts stopped the slicing before the threshold was reached.
+    starts : (M,) int array
+        Where each part begins in the sorted points: part m is ``points[:, starts[m]:starts[m] + counts[m]]``.
+    """
+
+    centroids: FloatArray
+    covariances: FloatArray
+    counts: NDArray[np.int64]
+    capped: bool
+    starts: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    def kept(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> Slices:
+        """Only the parts where the (M,) mask is true, or those of the given indices, in their order."""
+        return Slices(
+            self.centroids[keep],
+            self.covariances[keep],
+            self.counts[keep],
+            self.capped,
+            self.starts[keep],
+        )
+
+
 def coordinate_buffer(count: int) -> FloatArray:
     """Room for `count` points as three rows: (3, `count` or a little more), not initialised.
 

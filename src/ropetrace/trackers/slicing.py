@@ -5,11 +5,10 @@ Rastegarpanah, Howard and Stolkin, "Tracking linear deformable objects using sli
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 from numpy.typing import NDArray
 
+from ropetrace.axis import axis_points
 from ropetrace.centerline import SHORTEST_STEP, chain_tangents, extend_to_tips, make_waypoints
 from ropetrace.config import RopeConfig, SegmentationConfig, parse_color
 from ropetrace.errors import FrameError
@@ -19,13 +18,23 @@ from ropetrace.ordering import (
     order_greedy,
     order_path,
     runs_backwards,
-    sharpest_turn,
-    strands_overlap,
 )
 from ropetrace.segmentation import ColorGate, PositionBox, Segmenter
-from ropetrace.slicing import Slicer, Slices, axis_points
+from ropetrace.slicing import Slicer
 from ropetrace.trackers.base import Lap, Mask, no_lap
-from ropetrace.types import BadFrame, Cloud, CloudFrame, Estimate, FloatArray, Frame, RgbdFrame, Status, Waypoints
+from ropetrace.trackers.doubts import Doubts
+from ropetrace.types import (
+    BadFrame,
+    Cloud,
+    CloudFrame,
+    Estimate,
+    FloatArray,
+    Frame,
+    RgbdFrame,
+    Slices,
+    Status,
+    Waypoints,
+)
 
 
 class SlicingTracker:
@@ -57,8 +66,7 @@ class SlicingTracker:
         """Forget the frames so far."""
         self._chain: FloatArray | None = None
         self._waypoints: Waypoints | None = None
-        self._stamp_ns: int | None = None
-        self._lengths: deque[float] = deque(maxlen=_LATELY)
+        self._doubts = Doubts(self.config.diameter)
         self._points: FloatArray = np.empty((3, 0))
         self._slices: Slices | None = None
         if self.config.segmentation.color_pixel is not None:
@@ -75,7 +83,7 @@ class SlicingTracker:
         if isinstance(frame, BadFrame):
             self._points, self._slices = np.empty((3, 0)), None
             return Estimate.lost(frame.stamp_ns, frame.reason)
-        reasons = self._stamp_trouble(frame.stamp_ns)
+        reasons = self._doubts.of_stamp(frame.stamp_ns)
         self._points, self._slices = np.empty((3, 0)), None
 
         points, count, stride = self.rope_points(frame)
@@ -103,13 +111,14 @@ class SlicingTracker:
 
         tangents = chain_tangents(slices.centroids)
         nodes, widths = axis_points(points, slices, tangents, self.config.radius, self.config.slicing.surface_offset)
-        reasons += self._shape_trouble(nodes, widths)
+        self.seen_diameter = float(np.median(widths))
+        reasons += self._doubts.of_shape(nodes, widths)
         chain = extend_to_tips(nodes, _reach(slices, tangents))
         assert self.config.centerline.spacing is not None
         waypoints = make_waypoints(chain, self.config.centerline.spacing, self._waypoints)
         lap("centerline")
 
-        reasons += self._length_trouble(waypoints.length, sound=not reasons)
+        reasons += self._doubts.of_length(waypoints.length, sound=not reasons)
         self._slices, self._chain, self._waypoints = slices, slices.centroids, waypoints
         status = Status.DEGRADED if reasons else Status.OK
         return Estimate(frame.stamp_ns, status, tuple(reasons), nodes, waypoints, count, stride)
@@ -121,18 +130,6 @@ class SlicingTracker:
             for index, (start, count) in enumerate(zip(self._slices.starts, self._slices.counts, strict=True)):
                 node[start : start + count] = index
         return Cloud(self._points.T.copy(), node)
-
-    def _stamp_trouble(self, stamp_ns: int) -> list[str]:
-        previous, self._stamp_ns = self._stamp_ns, stamp_ns
-        if previous is None:
-            return []
-        if stamp_ns - previous > _LEAP_SECONDS * 1e9:
-            return [f"the stamp leaps ahead by {(stamp_ns - previous) / 1e9:.0f} s"]
-        if stamp_ns > previous:
-            return []
-        if stamp_ns == previous:
-            return ["the stamp repeats that of the frame before"]
-        return [f"the stamp runs back by {(previous - stamp_ns) / 1e9:.3f} s"]
 
     def rope_points(self, frame: Frame) -> tuple[FloatArray, int, int]:
         """The points to use, (3, N); how many passed the gates; and the stride that took these from them."""
@@ -202,37 +199,6 @@ class SlicingTracker:
             slices = slices.kept(np.arange(len(slices))[::-1])
         return slices, trouble
 
-    def _shape_trouble(self, nodes: FloatArray, widths: FloatArray) -> list[str]:
-        """What does not look like one tube of the stated diameter."""
-        diameter = self.config.diameter
-        self.seen_diameter = float(np.median(widths))
-        trouble = []
-        if not TOO_THIN * diameter < self.seen_diameter < TOO_WIDE * diameter:
-            trouble.append(
-                f"the points are as wide as a tube of {self.seen_diameter * 1e3:.1f} mm, not of "
-                f"{diameter * 1e3:.1f} mm: the diameter is wrong, or something else passes the colour or the box"
-            )
-        elif np.count_nonzero(widths > 2 * diameter) > 0.1 * len(widths):
-            trouble.append("parts are far wider than the rope: a hand, a knot or a branch is taken for rope")
-        if len(nodes) < _FEW_SLICES:
-            trouble.append(f"only {len(nodes)} slices: too short for a rope, or the diameter is too large")
-        if strands_overlap(nodes, diameter):
-            trouble.append("strands overlap in the camera's view: the order there may be wrong")
-        elif sharpest_turn(nodes) > _KINK:
-            trouble.append("the curve turns back sharply: the order there may be wrong")
-        if np.median(nodes[:, 2]) > _FARTHEST:
-            trouble.append(f"the points are {np.median(nodes[:, 2]):.0f} m away: is the recording in millimetres?")
-        return trouble
-
-    def _length_trouble(self, length: float, sound: bool) -> list[str]:
-        """Whether the length is not what it was lately, in the frames that had nothing else wrong with them."""
-        usual = float(np.median(self._lengths)) if self._lengths else length
-        if sound:
-            self._lengths.append(length)
-        if abs(length - usual) <= _LENGTH_CHANGE * usual:
-            return []
-        return [f"the length is {length:.3f} m and was {usual:.3f} m lately: a part is hidden, or something is added"]
-
     def _runs_backwards(self, chain: FloatArray) -> bool:
         ordering = self.config.ordering
         if ordering.follow_previous and self._chain is not None:
@@ -248,29 +214,8 @@ class SlicingTracker:
 BRIDGE_DIAMETERS = 3.0
 """A gap of more diameters than this in the chain is worth telling; a strand that crosses hides one."""
 
-TOO_THIN, TOO_WIDE = 0.6, 1.5
-"""Between these, in diameters, a rope may look wide: lost edges and coarse pixels make it thinner, noise wider."""
-
-_KINK = np.radians(100)
-"""No rope turns by more than this from one slice to the next."""
-
-_FEW_SLICES = 5
-"""Fewer slices than this are no rope's shape: a ball has as many."""
-
-_LENGTH_CHANGE = 0.15
-"""A rope whose length differs by more than this share from what it was lately is partly hidden, or not alone."""
-
-_LATELY = 31
-"""Frames whose lengths are remembered."""
-
-_LEAP_SECONDS = 60.0
-"""No camera pauses for longer between two frames of one recording."""
-
 _FEW = 20
 """Fewer points than this make no rope, however they lie."""
-
-_FARTHEST = 50.0
-"""No depth camera sees a rope from this far, metres."""
 
 _ALONG_VIEW = 0.3
 """How much a gap along the view counts: a rope that leads away from the camera hides its own next stretch."""
