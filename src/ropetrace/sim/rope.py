@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy.linalg
 
 from ropetrace.errors import ConfigError, import_extra
 from ropetrace.types import FloatArray
@@ -24,8 +25,11 @@ TIMESTEP = 1 / 480
 STEPS_PER_PERIOD = 40
 """A wind must blow at least this many steps from one period to the next, or its sine is not resolved."""
 
-SETTLE_SECONDS = 3.0
-"""How long a rope that is held at both ends is given to come to rest before time 0."""
+SETTLE_SWINGS = 10.0
+"""How long a rope that is held at both ends is given to come to rest before time 0, in units of sqrt(length / g)."""
+
+MOST_LINKS = 400
+"""MuJoCo's reader of XML takes no deeper nesting than 500."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +66,10 @@ class RopeModel:
     smooth: bool = False
 
     def __post_init__(self) -> None:
-        if not 1 <= self.links <= 500:
-            raise ConfigError(f"links = {self.links}: expected 1 to 500")
+        if not 1 <= self.links <= MOST_LINKS:
+            raise ConfigError(f"links = {self.links}: expected 1 to {MOST_LINKS}")
+        if self.top not in ("pinned", "clamped", "free"):
+            raise ConfigError(f"top = {self.top!r}: expected 'pinned', 'clamped' or 'free'")
         for name, least, most in (
             ("link_length", 1e-4, 10.0),
             ("radius", 1e-4, 0.5),
@@ -119,7 +125,7 @@ class Wind:
             )
         if not (math.isfinite(self.speed) and 0 <= self.coupling < 100):
             raise ConfigError(f"wind speed = {self.speed}, coupling = {self.coupling}: expected m/s and 0 to 100 1/s")
-        if abs(math.hypot(*self.direction) - 1) > 1e-6:
+        if not abs(math.hypot(*self.direction) - 1) <= 1e-6:
             raise ConfigError(f"wind direction = {self.direction}: expected a unit vector")
 
     def velocity(self, time: float) -> FloatArray:
@@ -182,7 +188,7 @@ class RopeSimulation:
     Raises
     ------
     ConfigError
-        If the arguments do not fit.
+        If the arguments do not fit, or the rope is too stiff or its links too short for the step.
     MissingExtraError
         If MuJoCo is not installed.
     """
@@ -201,20 +207,26 @@ class RopeSimulation:
             raise ConfigError(
                 f"lift = {lift} m: a rope of {model.length:g} m can be lifted by 0 to {2 * model.length:g} m"
             )
+        if lift and model.top == "clamped":
+            raise ConfigError("a clamped rope cannot be lifted: its first link does not turn")
+        if not np.isfinite(anchor).all():
+            raise ConfigError(f"anchor = {anchor}: expected three finite numbers of metres")
         if ends is not None and (model.top != "pinned" or lift):
             raise ConfigError("a rope that is held at both ends is neither clamped nor free nor lifted")
+        link_from_body = _link_axes(np.asarray(camera_axis, float))
+        start = np.asarray(anchor, float) if ends is None else _held(ends, 0.0, model)[0]
         mujoco = import_extra("mujoco", "sim")
         self.model = model
         self._mujoco = mujoco
         self._wind = wind if wind is not None and wind.frequency > 0 else None
         self._ends = ends
-        self._link_from_body = _link_axes(np.asarray(camera_axis, float))
-        start = np.asarray(anchor, float) if ends is None else ends(0.0)[0]
+        self._link_from_body = link_from_body
         self._physics = mujoco.MjModel.from_xml_string(_mjcf(model, start, ends is not None))
         self._data = mujoco.MjData(self._physics)
         self._links = slice(1, 1 + model.links)
         self._masses = self._physics.body_mass[self._links, None].copy()
         self._step = 0
+        self._fit_to_step()
         if lift:
             self._turn_about_top(math.acos(1 - lift / model.length))
         if ends is not None:
@@ -225,25 +237,59 @@ class RopeSimulation:
         """Turn the straight rope towards +x."""
         half = -angle / 2
         quaternion = [math.cos(half), 0.0, math.sin(half), 0.0]
-        if self.model.top == "clamped":
-            raise ConfigError("a clamped rope cannot be lifted: its first link does not turn")
         first = 3 if self.model.top == "free" else 0
         self._data.qpos[first : first + 4] = quaternion
 
+    def _fit_to_step(self) -> None:
+        """Choose the integrator, or refuse the rope, by the fastest motions of the chain that hangs straight."""
+        mujoco, physics, data, model = self._mujoco, self._physics, self._data, self.model
+        count = model.links - (model.top != "pinned" or self._ends is not None)
+        if count == 0:
+            return
+        # Round its own axis a thin link is so light that springs and damping would overrun the step: it is made heavier
+        # for the springs, and damped so that it stops within a few steps. A rope that bends in a plane does not twist.
+        physics.dof_armature[physics.nv - 3 * count + 2 :: 3] = model.stiffness * (TIMESTEP / 1.5) ** 2
+        mujoco.mj_forward(physics, data)
+        mass = np.zeros((physics.nv, physics.nv))
+        mujoco.mj_fullM(physics, data, mass)
+        first = physics.nv - 3 * count
+        bend, twist = mass[first::3, first::3], mass[first + 2 :: 3, first + 2 :: 3]
+        # A link's slope is the sum of the angles above it; gravity pulls each link straight by what hangs on it.
+        weight = model.link_mass * GRAVITY * model.link_length * (np.arange(count, 0, -1) - 0.5)
+        slope = np.tril(np.ones((count, count)))
+        springs = model.stiffness * np.eye(count)
+        fastest = TIMESTEP * math.sqrt(_largest(springs + slope.T * weight @ slope, bend))
+        if fastest > 1.8:
+            raise ConfigError(
+                f"a rope of {model.links} links of {model.link_length:g} m, {model.link_mass:g} kg and stiffness "
+                f"{model.stiffness:g} swings too fast for the step of {TIMESTEP * 1e3:.2f} ms: take fewer, longer or "
+                "thicker links, or less stiffness"
+            )
+        unit = TIMESTEP * _largest(np.eye(count), twist)
+        physics.dof_damping[first + 2 :: 3] = min(model.damping, 1.0 / unit)
+        if model.damping * TIMESTEP * _largest(np.eye(count), bend) > 2.0:
+            physics.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+
     def _settle(self, ends: EndsAt) -> None:
         """Bring the hanging rope's end to where it is held, and wait until it rests."""
-        first, last = ends(0.0)
+        first, last = _held(ends, 0.0, self.model)
         hanging = first - [0.0, 0.0, self.model.length]
-        steps = round(SETTLE_SECONDS / TIMESTEP)
-        damping = self._physics.dof_damping.copy()
-        # Rest comes sooner with stiff damping, which is taken away again.
-        self._physics.dof_damping[:] = np.maximum(damping, 2e-3)
+        # Straight up, the rope would not know to which side to bend.
+        straight_up = np.linalg.norm((last - first)[:2]) < 0.05 * self.model.length
+        bow = np.array([0.2 * self.model.length if straight_up else 0.0, 0.0, 0.0])
+        slowness = math.sqrt(self.model.length / GRAVITY)
+        steps = math.ceil(SETTLE_SWINGS * slowness / TIMESTEP)
+        forces = self._data.xfrc_applied[self._links, :3]
         for step in range(steps):
             part = min(2 * step / steps, 1.0)
             self._data.mocap_pos[0] = first
             self._data.mocap_pos[1] = hanging + (1 - math.cos(math.pi * part)) / 2 * (last - hanging)
+            self._data.mocap_pos[1] += math.sin(math.pi * part) * bow
+            # Still and thick air.
+            self._refresh()
+            forces[:] = self._masses * (-3 / slowness) * self._velocities()
             self._mujoco.mj_step(self._physics, self._data)
-        self._physics.dof_damping[:] = damping
+        forces[:] = 0
         self._data.qvel[:] = 0
         self._data.time = 0
 
@@ -271,9 +317,14 @@ class RopeSimulation:
                 self._refresh()
                 forces[:] = self._masses * wind.coupling * (wind.velocity(now) - self._velocities())
             if self._ends is not None:
-                data.mocap_pos[:] = self._ends(now + TIMESTEP)
+                data.mocap_pos[:] = _held(self._ends, now + TIMESTEP, self.model)
             mujoco.mj_step(physics, data)
-        self._step = target
+            self._step = step + 1
+        if not all(np.isfinite(array).all() and np.abs(array).max(initial=0) < 1e6 for array in (data.qpos, data.qvel)):
+            raise ConfigError(
+                f"the rope became unstable before {self.time:.3f} s: take fewer, longer or heavier links, less "
+                "stiffness or less damping"
+            )
         # After a step MuJoCo's positions and velocities are still those before it.
         self._refresh()
 
@@ -316,16 +367,34 @@ class RopeSimulation:
 
     def energy(self) -> float:
         """Kinetic and potential energy, joules; gravity's is 0 at the world's origin."""
+        # The integrator leaves the mass matrix of one of its stages.
+        self._mujoco.mj_crb(self._physics, self._data)
         self._mujoco.mj_energyPos(self._physics, self._data)
         self._mujoco.mj_energyVel(self._physics, self._data)
         return float(self._data.energy.sum())
+
+
+def _largest(matrix: FloatArray, mass: FloatArray) -> float:
+    """Largest eigenvalue of ``mass^-1 matrix``."""
+    return float(scipy.linalg.eigh(matrix, mass, eigvals_only=True, subset_by_index=[len(mass) - 1] * 2)[0])
+
+
+def _held(ends: EndsAt, time: float, model: RopeModel) -> FloatArray:
+    """Where the ends are held, (2, 3), checked."""
+    places = np.asarray(ends(time), float)
+    if places.shape != (2, 3) or not np.isfinite(places).all():
+        raise ConfigError(f"the held ends at {time:.3f} s are not two points of finite coordinates")
+    apart = float(np.linalg.norm(places[1] - places[0]))
+    if apart > model.length:
+        raise ConfigError(f"the held ends are {apart:.3f} m apart at {time:.3f} s: the rope is {model.length:g} m long")
+    return places
 
 
 def _link_axes(camera_axis: FloatArray) -> FloatArray:
     """Columns X, Y, Z of a hanging link's frame in its body's frame, whose z axis points up."""
     x = np.array([0.0, 0.0, -1.0])
     y = np.cross(x, camera_axis)
-    if np.linalg.norm(y) < 1e-6:
+    if not 1e-6 <= np.linalg.norm(y) < math.inf:
         raise ConfigError(f"camera_axis = {camera_axis}: a camera that looks along a hanging rope gives it no frame")
     y /= np.linalg.norm(y)
     return np.stack([x, y, np.cross(x, y)], axis=1)
@@ -350,12 +419,18 @@ def _mjcf(model: RopeModel, start: FloatArray, held: bool) -> str:
         end = start - [0.0, 0.0, model.length]
         body = body.replace(first, "<freejoint/>", 1)
         holds = "".join(
-            f'<body name="hold{k}" mocap="true" pos="{" ".join(map(repr, place.tolist()))}"><site name="hold{k}"/></body>'
+            f'<body name="hold{k}" mocap="true" pos="{" ".join(map(repr, place.tolist()))}"><site name="hold{k}"/>'
+            "</body>"
             for k, place in enumerate((start, end))
         )
         body = body.replace("<freejoint/>", '<freejoint/><site name="start"/>', 1)
-        ties = f'<equality><connect site1="start" site2="hold0" {_HOLD}/><connect site1="end" site2="hold1" {_HOLD}/></equality>'
+        ties = (
+            f'<equality><connect site1="start" site2="hold0" {_HOLD}/>'
+            f'<connect site1="end" site2="hold1" {_HOLD}/></equality>'
+        )
+    integrator = "implicitfast" if held else "RK4"
     return (
-        f'<mujoco><option timestep="{TIMESTEP!r}" integrator="{"implicitfast" if held else "RK4"}" gravity="0 0 {-GRAVITY!r}">'
-        f'<flag contact="disable" energy="disable"/></option><worldbody>{body}{holds}</worldbody>{ties}</mujoco>'
+        f'<mujoco><option timestep="{TIMESTEP!r}" integrator="{integrator}" gravity="0 0 {-GRAVITY!r}">'
+        '<flag contact="disable" energy="disable" autoreset="disable"/></option>'
+        f"<worldbody>{body}{holds}</worldbody>{ties}</mujoco>"
     )

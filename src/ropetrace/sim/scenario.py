@@ -19,7 +19,7 @@ from ropetrace.errors import ConfigError
 from ropetrace.evaluation.metrics import resample
 from ropetrace.sim.camera import DepthCamera
 from ropetrace.sim.noise import noise_model
-from ropetrace.sim.rope import EndsAt, RopeModel, RopeSimulation, RopeState, Wind
+from ropetrace.sim.rope import STEPS_PER_PERIOD, TIMESTEP, EndsAt, RopeModel, RopeSimulation, RopeState, Wind
 from ropetrace.sim.scene import Boxes, Capsules, Plane, Scene, check_camera_outside, inverse_pose, looking_at
 from ropetrace.sim.visibility import visible_fraction
 from ropetrace.types import FloatArray, RgbdFrame
@@ -86,6 +86,16 @@ class MotionSettings:
     sway_frequency: float = 0.5
     """Hz."""
 
+    def __post_init__(self) -> None:
+        for name in ("anchor", "far_end", "sway", "sway_frequency"):
+            if getattr(self, name) is not None and not np.isfinite(getattr(self, name)).all():
+                raise ConfigError(f"motion.{name} = {getattr(self, name)}: expected finite numbers")
+        if self.far_end is None and any(self.sway):
+            raise ConfigError("motion.sway moves a held end: give motion.far_end, or leave it out")
+        most = 1 / (STEPS_PER_PERIOD * TIMESTEP)
+        if not 0 <= self.sway_frequency <= most:
+            raise ConfigError(f"motion.sway_frequency = {self.sway_frequency}: expected 0 to {most:g} Hz")
+
     def ends(self) -> EndsAt | None:
         """Where both ends are held at a time, if they are."""
         if self.far_end is None:
@@ -100,7 +110,7 @@ class MotionSettings:
 
 @dataclass(frozen=True, slots=True)
 class ClutterSettings:
-    """The `[clutter]` table of a scenario: what else the camera sees."""
+    """The `[clutter]` table of a scenario: what else the camera sees. Nothing collides: the rope passes through it."""
 
     wall: float | None = None
     """A wall at this y."""
@@ -111,7 +121,17 @@ class ClutterSettings:
     robot: tuple[tuple[float, float, float, float, float, float, float], ...] = ()
     """Links of a robot: capsules from x, y, z to x, y, z with a radius."""
     second_rope: Vector | None = None
-    """Another rope of the same kind and colour, hung this far from the first."""
+    """Another rope of the same kind and colour, that moves as the first does, this far from it."""
+
+    def __post_init__(self) -> None:
+        for name in ("wall", "floor", "boxes", "robot", "second_rope"):
+            value = getattr(self, name)
+            if value is not None and not np.isfinite(value).all():
+                raise ConfigError(f"clutter.{name} = {value}: expected finite numbers")
+        if any(min(box[3:]) <= 0 for box in self.boxes):
+            raise ConfigError("clutter.boxes: the last three numbers of a box are its edges, above 0")
+        if any(link[6] <= 0 for link in self.robot):
+            raise ConfigError("clutter.robot: the last number of a link is its radius, above 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +156,16 @@ class Scenario:
 
     def __post_init__(self) -> None:
         if not 0 < self.duration <= 86400:
-            raise ConfigError(f"duration = {self.duration}: expected 0 to 86400 seconds")
+            raise ConfigError(f"duration = {self.duration}: expected more than 0, and 86400 seconds at most")
+        motion = self.motion
+        if motion.far_end is not None:
+            # The ends are farthest apart where the sway turns round.
+            far, sway = np.subtract(motion.far_end, motion.anchor), np.array(motion.sway)
+            apart = max(float(np.linalg.norm(far + sway)), float(np.linalg.norm(far - sway)))
+            if apart > self.rope.length:
+                raise ConfigError(
+                    f"motion.far_end gets {apart:.3f} m from motion.anchor, and the rope is {self.rope.length:g} m long"
+                )
 
     @property
     def frame_count(self) -> int:
@@ -261,22 +290,22 @@ class SimulatedScene:
                 yield frame, self.truth()
 
     def _blurred_frame(self, stamp: float, index: int) -> tuple[RgbdFrame, Truth]:
-        truths: list[tuple[float, Truth]] = []
+        truths: list[Truth] = []
 
         def scene_at(time: float) -> Scene:
-            scene = self.scene_at(time)
-            truths.append((abs(time - stamp), self.truth()))
-            return scene
+            if not truths and time >= stamp:
+                self.rope.advance(stamp)
+                truths.append(self.truth())
+            return self.scene_at(time)
 
         frame = self.camera.expose(scene_at, stamp, index)
-        return frame, min(truths, key=lambda pair: pair[0])[1]
+        return frame, truths[0]
 
 
 def scenario_names() -> list[str]:
     """The scenarios that the package ships."""
-    return sorted(
-        entry.name.removesuffix(".toml") for entry in resources.files(__package__).joinpath("scenarios").iterdir()
-    )
+    files = resources.files(__package__).joinpath("scenarios").iterdir()
+    return sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml"))
 
 
 def load_scenario(name: str) -> Scenario:
