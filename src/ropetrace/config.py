@@ -397,7 +397,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: not a TOML file: {error}") from None
 
 
-def from_table(cls: type[Any], table: dict[str, Any], where: str = "") -> Any:
+def from_table(cls: type[Any], table: dict[str, Any], where: str = "", root: type[Any] | None = None) -> Any:
     """A dataclass of settings from a TOML table, with every key and type checked.
 
     Raises
@@ -410,12 +410,12 @@ def from_table(cls: type[Any], table: dict[str, Any], where: str = "") -> Any:
     values: dict[str, Any] = {}
     for key, value in table.items():
         if key not in known:
-            raise ConfigError(f"unknown setting {where}{key}{_nearest(key, where, known)}")
+            raise ConfigError(f"unknown setting {where}{key}{_nearest(key, where, known, root or cls)}")
         hint = hints[key]
         if dataclasses.is_dataclass(hint):
             if not isinstance(value, dict):
                 raise ConfigError(f"{where}{key} is a table: write [{where}{key}]")
-            values[key] = from_table(typing.cast(type[Any], hint), value, f"{where}{key}.")
+            values[key] = from_table(typing.cast(type[Any], hint), value, f"{where}{key}.", root or cls)
         else:
             values[key] = _converted(value, hint, known[key].metadata.get("unit") == "length", where + key)
     missing = [
@@ -428,20 +428,20 @@ def from_table(cls: type[Any], table: dict[str, Any], where: str = "") -> Any:
     return cls(**values)
 
 
-def _nearest(key: str, where: str, known: dict[str, Any]) -> str:
-    """A hint at the setting that was meant: in this table, else in any."""
+def _nearest(key: str, where: str, known: dict[str, Any], root: type[Any]) -> str:
+    """A hint at the setting that was meant: in this table, else in any of the file."""
     close = difflib.get_close_matches(key, known, 1)
     if close:
         return f": did you mean {where}{close[0]}?"
-    everywhere = {item.name: item.name for item in dataclasses.fields(RopeConfig)}
-    for item in dataclasses.fields(RopeConfig):
+    everywhere = {item.name: item.name for item in dataclasses.fields(root)}
+    for item in dataclasses.fields(root):
         if dataclasses.is_dataclass(item.default_factory):
             everywhere |= {
                 inner.name: f"{item.name}.{inner.name}"
                 for inner in dataclasses.fields(typing.cast(type[Any], item.default_factory))
             }
     close = difflib.get_close_matches(key, everywhere, 1)
-    if close:
+    if close and everywhere[close[0]] != f"{where}{key}":
         return f": did you mean {everywhere[close[0]]}?"
     return f"; known here: {', '.join(known)}"
 
