@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from ropetrace.cli_simulation import Reproduce, Simulate
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
 
 if TYPE_CHECKING:
@@ -252,7 +253,9 @@ def main() -> None:
         Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Track, tyro.conf.subcommand("track")]
         | Annotated[Info, tyro.conf.subcommand("info")]
-        | Annotated[Doctor, tyro.conf.subcommand("doctor")],  # type: ignore[arg-type]
+        | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+        | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+        | Annotated[Reproduce, tyro.conf.subcommand("reproduce")],  # type: ignore[arg-type]
         prog="ropetrace",
         description="The 3-D shape of a rope, cable or hose from the recordings of an RGB-D camera. "
         "`ropetrace --version` tells the version.",

@@ -76,9 +76,10 @@ class Case1Settings:
     noise: str = "none"
     """Of the depth camera: Gazebo's had none."""
     method: str = "slicing"
-    phase: float = 0.5
-    """When frames are taken, in frame intervals after a reading: a camera that nobody synchronises has 0.5 in the mean;
-    0 is the worst, since a frame of the very moment of a reading comes too late for it."""
+    phase: float | None = None
+    """When frames are taken, in frame intervals after a reading; 0 is the worst, since a frame of the very moment of a
+    reading comes too late for it. None is a camera that nobody synchronises: its clock is slow by one frame interval in
+    the whole run (0.01 % in 300 s), so that every phase comes equally often."""
     latency: float | None = None
     """From the arrival of a frame to its centreline, seconds; None is measured."""
     seed: int = 0
@@ -89,7 +90,7 @@ class Case1Settings:
         steps = self.interval / TIMESTEP
         if steps < 1 or abs(steps - round(steps)) > 1e-6:
             raise ConfigError(f"interval = {self.interval} s: expected a multiple of the step, {TIMESTEP:.6f} s")
-        if not 0 <= self.phase < 1:
+        if self.phase is not None and not 0 <= self.phase < 1:
             raise ConfigError(f"phase = {self.phase}: expected 0 to 1 frame intervals")
         if self.latency is not None and not 0 <= self.latency <= 10:
             raise ConfigError(f"latency = {self.latency} s: expected 0 to 10 s")
@@ -124,8 +125,8 @@ class Readings:
         How far the true curve moved since then: mean distance of the one to the other, metres.
     speed : float
         Mean speed of the links, m/s.
-    angular_floor : float
-        The angular error of a perfect curve: a spline through the true joints, against the ten straight links.
+    linear_floor, angular_floor : float
+        The errors of a perfect curve: a spline through the true joints, against the ten straight links.
     """
 
     time: FloatArray
@@ -139,6 +140,7 @@ class Readings:
     angular_at_stamp: FloatArray
     moved: FloatArray
     speed: FloatArray
+    linear_floor: FloatArray
     angular_floor: FloatArray
 
     @classmethod
@@ -209,6 +211,13 @@ def schedule(arrivals: FloatArray, compute_time: float) -> list[tuple[int, float
     return done
 
 
+def frame_stamps(rate: float, count: int, settings: Case1Settings) -> FloatArray:
+    """When the frames are taken, (count,), seconds: at whole steps of the simulation."""
+    index = np.arange(count)
+    phase = index / (rate * settings.duration) if settings.phase is None else np.full(count, settings.phase)
+    return np.round((index + phase) / rate / TIMESTEP) * TIMESTEP
+
+
 def run_case(condition: Condition, frequency: float, settings: Case1Settings, compute_time: float) -> Readings:
     """One case: all its readings, none removed.
 
@@ -227,14 +236,11 @@ def run_case(condition: Condition, frequency: float, settings: Case1Settings, co
     return Readings.of(list(_readings(simulated, settings, compute_time)))
 
 
-def _readings(
-    simulated: SimulatedScene, settings: Case1Settings, compute_time: float
-) -> Iterator[dict[str, Any]]:
+def _readings(simulated: SimulatedScene, settings: Case1Settings, compute_time: float) -> Iterator[dict[str, Any]]:
     tracker = make_tracker(rope_config(settings))
     camera = simulated.camera
     moments = settings.warm_up + settings.interval * np.arange(1, settings.readings + 1)
-    late = settings.phase / camera.rate
-    stamps = np.array([camera.stamp(index) + late for index in range(simulated.scenario.frame_count)])
+    stamps = frame_stamps(camera.rate, simulated.scenario.frame_count, settings)
     done = schedule(np.array([camera.arrival(stamp) for stamp in stamps]), compute_time)
     waiting: list[tuple[float, float, Estimate, Truth]] = []
     newest: tuple[float, float, Estimate, Truth] | None = None
@@ -267,6 +273,7 @@ def _reading(moment: float, newest: tuple[float, float, Estimate, Truth] | None,
         "angular_at_stamp": missing,
         "moved": missing,
         "speed": float(np.linalg.norm(truth.state.velocities, axis=1).mean()),
+        "linear_floor": float(linear_errors(ideal.positions, truth.polyline).mean()),
         "angular_floor": float(
             angular_errors(ideal.positions, ideal.quaternions, truth.polyline, truth.link_quaternions).mean()
         ),
