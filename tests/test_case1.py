@@ -276,7 +276,8 @@ def test_the_parts_of_the_error_at_the_resonance_make_it_up() -> None:
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if " 30fps |" in line]
     mean_error, linear, angular = rows[-3:]
     assert mean_error[1:] == ["1", "2.500", "9.70"]
-    moved, own, rest, total = map(float, linear[4:])
+    moved, own, spline, rest, total = map(float, linear[4:])
+    assert spline == 0.1
     assert moved + own + rest == pytest.approx(total)
     assert linear[3] == "1.250", "age x speed: 2.5 ms at 0.5 m/s"
     floor, beyond, age, whole = map(float, angular[1:])

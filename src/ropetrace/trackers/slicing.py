@@ -1,4 +1,4 @@
-"""The paper's tracker: segmentation, slicing, ordering, centreline. Each frame stands for itself.
+"""The paper's tracker: segmentation, slicing, ordering, centreline. The shape of each frame stands for itself.
 
 Rastegarpanah, Howard and Stolkin, "Tracking linear deformable objects using slicing method", Robotica 40 (2022).
 """
