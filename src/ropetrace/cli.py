@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import OmitArgPrefixes, arg
 
 from ropetrace.cli_simulation import Reproduce, Simulate
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
@@ -36,20 +36,20 @@ _DOCTOR_PICTURE = Path("ropetrace-doctor.png")
 class Source:
     """Which recording, and which part of it."""
 
-    recording: Positional[Path]
+    recording: Annotated[Path, tyro.conf.Positional, arg(metavar="RECORDING")]
     """An RGB-D folder, a ROS 2 bag (.mcap, .db3, or their folder), a ROS 1 .bag, or point clouds (a folder of .npy,
     .npz, .ply, .pcd, or one of them)."""
-    rate: float | None = None
+    rate: Annotated[float | None, arg(metavar="HZ")] = None
     """Frames per second, for recordings without stamps."""
-    start: int = 0
+    start: Annotated[int, arg(metavar="N")] = 0
     """Frames to skip."""
-    limit: int | None = None
+    limit: Annotated[int | None, arg(metavar="N")] = None
     """Frames to use at most."""
-    depth_topic: str | None = None
+    depth_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
     """ROS: the depth images. Found by type if not given."""
-    color_topic: str | None = None
+    color_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
     """ROS: the colour images. Found by type if not given."""
-    cloud_topic: str | None = None
+    cloud_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
     """ROS: point clouds, in the place of depth images."""
 
     def open(self) -> Recording:
@@ -77,9 +77,9 @@ class Rope:
     """The rope's diameter, such as 12mm. Needed here or in the config."""
     color: Annotated[str | None, arg(aliases=["-c"], metavar="'#RRGGBB'")] = None
     """The rope's colour in full light, such as '#c8281e'. Without it, everything with depth is rope."""
-    config: Path | None = None
+    config: Annotated[Path | None, arg(metavar="FILE")] = None
     """A TOML file with further settings; those given here count first."""
-    method: str | None = None
+    method: Annotated[str | None, arg(metavar="NAME")] = None
     """The tracker: slicing (the default)."""
 
     def settings(self) -> RopeConfig:
@@ -145,9 +145,9 @@ class Track:
     rope: OmitArgPrefixes[Rope]
     out: Annotated[tuple[Path, ...], arg(aliases=["-o"], metavar="FILE ...")] = ()
     """Results: .csv, .parquet, .npz, .mcap or .rrd; several may be given."""
-    picture: Path | None = None
+    picture: Annotated[Path | None, arg(metavar="FILE")] = None
     """A picture of six frames spread over the run, with the centreline drawn over them."""
-    mask: Path | None = None
+    mask: Annotated[Path | None, arg(metavar="FILE")] = None
     """An image of the frames' size, white where the rope may be; replaces the colour."""
     frame: Literal["camera", "world"] = "camera"
     """The frame of the results; world needs camera_pose in the config."""
