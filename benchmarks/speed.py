@@ -179,7 +179,7 @@ def plot(rows: list[tuple[int, float]], path: Path) -> None:
     reference = counts * np.log(counts)
     figure, axes = plt.subplots(figsize=(6, 4))
     axes.loglog(counts, seconds * 1e3, "o-", label="whole frame")
-    anchor = int(np.searchsorted(counts, 30_000))
+    anchor = min(int(np.searchsorted(counts, 30_000)), len(counts) - 1)
     axes.loglog(counts, reference / reference[anchor] * seconds[anchor] * 1e3, "k:", label="N log N")
     axes.set_xlabel("rope points")
     axes.set_ylabel("time per frame, ms (p50, one thread)")
