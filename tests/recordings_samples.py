@@ -14,9 +14,9 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as FolderWriter
 
-from ropetrace.recordings.base import Event, Recording
+from ropetrace.recordings.base import Recording
 from ropetrace.recordings.ros_messages import CAMERA, CLOUD, COMPRESSED, IMAGE, typestore
-from ropetrace.types import BadFrame, CloudFrame, Intrinsics, RgbdFrame
+from ropetrace.types import BadFrame, CloudFrame, Event, Intrinsics, RgbdFrame
 
 CAMERA_8X6 = Intrinsics(8, 6, 9.5, 9.25, 3.5, 2.75)
 STEP_NS = 33_333_333

@@ -24,6 +24,7 @@ from ropetrace import cli, demo
 from ropetrace.recordings.mcap_file import McapFrameWriter
 from ropetrace.recordings.rgbd_folder import RgbdFolderWriter
 from ropetrace.sim.camera import Capsules, RayCaster, Scene
+from ropetrace.terminal import INTERRUPTED
 from ropetrace.types import Intrinsics, RgbdFrame
 
 CAMERA = Intrinsics(160, 120, 145.0, 145.0, 79.5, 59.5)
@@ -452,7 +453,7 @@ def test_an_interrupted_run_leaves_what_it_had(tmp_path: Path) -> None:
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
-    assert process.returncode == cli.INTERRUPTED, err
+    assert process.returncode == INTERRUPTED, err
     assert "interrupted" in err
     assert "Traceback" not in err
     frames = statuses(tmp_path / "r.csv")

@@ -13,8 +13,8 @@ from helpers import RED_TEXT, SHAPES, SMALL, random_rotation, seen
 from ropetrace.config import RopeConfig
 from ropetrace.errors import OutputError
 from ropetrace.trackers import SlicingTracker
-from ropetrace.tracking import Event, Summary, in_world, track_recording
-from ropetrace.types import BadFrame, Cloud, Estimate, Frame, RgbdFrame, Status
+from ropetrace.tracking import Summary, in_world, track_recording
+from ropetrace.types import BadFrame, Cloud, Estimate, Event, Frame, RgbdFrame, Status
 
 HANGING = SHAPES["hanging"]
 CONFIG = RopeConfig(diameter=0.012, color=RED_TEXT)

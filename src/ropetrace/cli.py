@@ -18,6 +18,7 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from ropetrace.cli_simulation import Reproduce, Simulate
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
+from ropetrace.terminal import INTERRUPTED, progress_bar
 
 if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 
 _MOST_FRAMES = 10**12
 
-BAD_INPUT, NOTHING_FOUND, DAMAGED, INTERRUPTED = 2, 1, 3, 130
-"""Exit codes: what was given is wrong; no frame gave an estimate; part of the recording was lost; Ctrl-C."""
+BAD_INPUT, NOTHING_FOUND, DAMAGED = 2, 1, 3
+"""Exit codes: what was given is wrong; no frame gave an estimate; part of the recording was lost."""
 
 
 _DOCTOR_PICTURE = Path("ropetrace-doctor.png")
@@ -107,7 +108,7 @@ class Demo:
 
     def run(self) -> int:
         from ropetrace import demo
-        from ropetrace.config import RopeConfig
+        from ropetrace.config import RopeConfig, format_color
         from ropetrace.recordings import open_recording
 
         recording_folder = self.out / "recording"
@@ -118,7 +119,7 @@ class Demo:
         if not recording_folder.exists():
             print(f"making a recording of {demo.FRAMES} frames ...")
             demo.make_recording(recording_folder)
-        config = RopeConfig(demo.DIAMETER, "#{:02x}{:02x}{:02x}".format(*demo.COLOR))
+        config = RopeConfig(demo.DIAMETER, format_color(demo.COLOR))
         result, picture = self.out / "result.csv", self.out / "result.png"
         print("tracking it (the first run on a machine compiles for some seconds) ...")
         truth = _TruthOfDemo()
@@ -388,10 +389,8 @@ def _track(
 
 @contextmanager
 def _progress(total: int | None) -> Iterator[Any]:
-    """A bar with frames per second on a terminal; nothing when piped."""
-    from tqdm import tqdm
-
-    with tqdm(total=total, unit="frame", disable=not sys.stderr.isatty(), leave=False) as bar:
+    """A bar of frames that is told of statuses."""
+    with progress_bar(total, "frame") as bar:
 
         def advance(status: str) -> None:
             bar.set_postfix_str(status, refresh=False)

@@ -14,9 +14,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from ropetrace.errors import ConfigError, import_extra
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C."""
+from ropetrace.terminal import INTERRUPTED, progress_bar
 
 QUICK_SECONDS = 10.0
 """Of a case, with --quick."""
@@ -170,10 +168,8 @@ def parse_duration(text: str) -> float:
 
 @contextmanager
 def _progress(total: int, unit: str) -> Iterator[Any]:
-    """A bar on a terminal; nothing when piped."""
-    from tqdm import tqdm
-
-    with tqdm(total=total, unit=unit, disable=not sys.stderr.isatty(), leave=False) as bar:
+    """A bar that is told of counts."""
+    with progress_bar(total, unit) as bar:
 
         def advance(count: int = 1) -> None:
             bar.update(count)
@@ -184,6 +180,7 @@ def _progress(total: int, unit: str) -> Iterator[Any]:
 
 
 def _rope_color() -> str:
+    from ropetrace.config import format_color
     from ropetrace.sim.scenario import ROPE_COLOR
 
-    return "#{:02x}{:02x}{:02x}".format(*ROPE_COLOR)
+    return format_color(ROPE_COLOR)

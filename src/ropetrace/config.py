@@ -15,6 +15,7 @@ import stat
 import tomllib
 import types
 import typing
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from pathlib import Path
@@ -82,6 +83,11 @@ def parse_color(text: str) -> tuple[int, int, int]:
     if numbers and all(int(number) <= 255 for number in numbers.groups()):
         return int(numbers[1]), int(numbers[2]), int(numbers[3])
     raise ConfigError(f"{text!r} is not a colour: write it like '#c8281e' or '200,40,30' (sRGB)")
+
+
+def format_color(rgb: Iterable[int]) -> str:
+    """``#rrggbb`` of an sRGB colour, as `parse_color` reads it."""
+    return "#{:02x}{:02x}{:02x}".format(*rgb)
 
 
 def _require(condition: bool, message: str) -> None:

@@ -11,13 +11,22 @@ from enum import StrEnum
 import numpy as np
 from PIL import Image
 
-from ropetrace.config import RopeConfig, parse_color
+from ropetrace.config import RopeConfig, format_color, parse_color
 from ropetrace.errors import FrameError
 from ropetrace.picture import captioned, depth_image, sheet
 from ropetrace.recordings import RecordingInfo, StreamInfo
 from ropetrace.segmentation import lab_from_rgb
 from ropetrace.trackers.slicing import SlicingTracker
-from ropetrace.types import BadFrame, CloudFrame, FloatArray, Frame, Intrinsics, RgbdFrame, Status, lacks_color
+from ropetrace.types import (
+    BadFrame,
+    FloatArray,
+    Frame,
+    Intrinsics,
+    RgbdFrame,
+    Status,
+    colors_of,
+    lacks_color,
+)
 
 
 class Grade(StrEnum):
@@ -273,7 +282,7 @@ def _color_advice(frames: list[Frame], config: RopeConfig) -> str:
 def _nearest_color(frames: list[Frame], config: RopeConfig) -> str:
     """The scene's own colour of the given hue, as a hint."""
     frame = frames[0]
-    colors = frame.colors if isinstance(frame, CloudFrame) else frame.color
+    colors = colors_of(frame)
     if colors is None or config.color is None:
         return ""
     colors = colors.reshape(-1, 3)[:: max(colors.size // 3 // 50000, 1)]
@@ -282,7 +291,7 @@ def _nearest_color(frames: list[Frame], config: RopeConfig) -> str:
     distance = np.linalg.norm((lab_from_rgb(colors) - wanted) * [0.3, 1, 1], axis=1)
     closest = colors[np.argsort(distance)[: max(len(colors) // 500, 5)]]
     bright = closest[np.argmax(closest.sum(axis=1))]
-    return " (the closest in the first frame is '#{:02x}{:02x}{:02x}')".format(*bright)
+    return f" (the closest in the first frame is '{format_color(bright)}')"
 
 
 def _gate_picture(frames: list[tuple[int, Frame]], config: RopeConfig) -> Image.Image | None:

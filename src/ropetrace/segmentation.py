@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ropetrace.types import CloudFrame, FloatArray, Frame, Intrinsics, RgbdFrame, coordinate_buffer
+from ropetrace.types import CloudFrame, FloatArray, Frame, Intrinsics, RgbdFrame, coordinate_buffer, moved
 
 DARKEST, BRIGHTEST = 0.12, 1.3
 """Light on the rope relative to full light, linear: at its shaded edge, and where it is slightly over-exposed."""
@@ -32,7 +32,8 @@ def _linear_table() -> FloatArray:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-_LINEAR_OF_SRGB = _linear_table()
+LINEAR_OF_SRGB = _linear_table()
+"""Linear light of each sRGB byte, (256,), 0 to 1 (IEC 61966-2-1)."""
 
 
 def lab_from_linear(linear: FloatArray) -> FloatArray:
@@ -59,7 +60,7 @@ def lab_from_linear(linear: FloatArray) -> FloatArray:
 
 def lab_from_rgb(rgb: NDArray[np.uint8]) -> FloatArray:
     """CIELAB (D65) from (..., 3) sRGB bytes."""
-    return lab_from_linear(_LINEAR_OF_SRGB[rgb])
+    return lab_from_linear(LINEAR_OF_SRGB[rgb])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +85,7 @@ class ColorGate:
         measured to that curve, so that a tube's dark edges pass where another hue of the same darkness does not. The
         curve runs from `DARKEST` to `brightest` times the given light.
         """
-        shades = np.geomspace(DARKEST, brightest, 24)[:, None] * _LINEAR_OF_SRGB[np.array(rgb)]
+        shades = np.geomspace(DARKEST, brightest, 24)[:, None] * LINEAR_OF_SRGB[np.array(rgb)]
         return cls(lab_from_linear(shades), tolerance)
 
     @classmethod
@@ -119,8 +120,7 @@ class PositionBox:
     def camera_bounds(self) -> tuple[FloatArray, FloatArray]:
         """The corners of the smallest box of the camera's frame that holds this one, metres."""
         corners = np.array(np.meshgrid(*zip(self.low, self.high, strict=True))).reshape(3, -1).T
-        camera_from_box = np.linalg.inv(self.box_from_camera)
-        corners = corners @ camera_from_box[:3, :3].T + camera_from_box[:3, 3]
+        corners = moved(corners, np.linalg.inv(self.box_from_camera).astype(float))
         return corners.min(axis=0), corners.max(axis=0)
 
 
@@ -270,7 +270,7 @@ def _raw_range(dtype: np.dtype[Any], unit: float, bounds: tuple[FloatArray, Floa
 @njit(cache=True, nogil=True)
 def _within(r: int, g: int, b: int, line: Any, tolerance: float) -> bool:
     """Judge one sRGB colour by its place in CIELAB."""
-    linear = (_LINEAR_OF_SRGB[r], _LINEAR_OF_SRGB[g], _LINEAR_OF_SRGB[b])
+    linear = (LINEAR_OF_SRGB[r], LINEAR_OF_SRGB[g], LINEAR_OF_SRGB[b])
     f = np.empty(3)
     for row in range(3):
         ratio = (

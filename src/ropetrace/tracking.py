@@ -13,9 +13,7 @@ import numpy as np
 from ropetrace.errors import FrameError
 from ropetrace.results.base import uninterrupted
 from ropetrace.trackers.base import Tracker
-from ropetrace.types import BadFrame, Cloud, Estimate, FloatArray, Frame, Status
-
-Event = Frame | BadFrame
+from ropetrace.types import BadFrame, Cloud, Estimate, Event, FloatArray, Frame, Status, moved
 
 
 class Sink(Protocol):
@@ -146,7 +144,7 @@ def track_recording(
                 estimate = in_world(estimate, world_from_camera)
             cloud = tracker.cloud() if wants_cloud and not isinstance(event, BadFrame) else None
             if cloud is not None and world_from_camera is not None:
-                cloud = Cloud(_moved(cloud.points, world_from_camera), cloud.node)
+                cloud = Cloud(moved(cloud.points, world_from_camera), cloud.node)
             watch.lap("")
             # A frame is in all results and in the summary, or in none.
             with uninterrupted():
@@ -167,13 +165,9 @@ def in_world(estimate: Estimate, world_from_camera: FloatArray) -> Estimate:
     """The estimate with its positions and orientations in the world's frame."""
     return replace(
         estimate,
-        nodes=_moved(estimate.nodes, world_from_camera),
+        nodes=moved(estimate.nodes, world_from_camera),
         waypoints=estimate.waypoints.transformed(world_from_camera),
     )
-
-
-def _moved(points: FloatArray, transform: FloatArray) -> FloatArray:
-    return points @ transform[:3, :3].T + transform[:3, 3]
 
 
 def _estimate(event: Event, tracker: Tracker, watch: _Stopwatch) -> Estimate:

@@ -158,9 +158,23 @@ Frame = RgbdFrame | CloudFrame
 """What a tracker takes."""
 
 
+Event = Frame | BadFrame
+"""What a recording yields."""
+
+
+def colors_of(frame: Frame) -> NDArray[np.uint8] | None:
+    """The colours of an image, (H, W, 3), or of a cloud, (N, 3), if it has any."""
+    return frame.colors if isinstance(frame, CloudFrame) else frame.color
+
+
 def lacks_color(frame: Frame) -> bool:
     """Whether there is nothing for a colour gate to look at."""
-    return (frame.colors if isinstance(frame, CloudFrame) else frame.color) is None
+    return colors_of(frame) is None
+
+
+def moved(points: FloatArray, target_from_source: FloatArray) -> FloatArray:
+    """Points, (N, 3), in another frame, by a (4, 4) rigid transform."""
+    return points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
 
 
 class Status(StrEnum):
@@ -223,7 +237,7 @@ class Waypoints:
             return self
         rotation = Rotation.from_matrix(target_from_source[:3, :3])
         return Waypoints(
-            self.positions @ target_from_source[:3, :3].T + target_from_source[:3, 3],
+            moved(self.positions, target_from_source),
             np.asarray((rotation * Rotation.from_quat(self.quaternions)).as_quat()),
             self.arc_length,
         )

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ropetrace.centerline import make_waypoints
-from ropetrace.config import RopeConfig
+from ropetrace.config import RopeConfig, format_color
 from ropetrace.errors import ConfigError
 from ropetrace.evaluation.metrics import coverage, symmetric_mean
 from ropetrace.evaluation.paper_errors import angular_errors, linear_errors
@@ -151,7 +151,7 @@ class Readings:
 
 def rope_config(settings: Case1Settings) -> RopeConfig:
     """What the tracker is told: the diameter and the colour."""
-    return RopeConfig(0.015, "#{:02x}{:02x}{:02x}".format(*ROPE_COLOR), settings.method)
+    return RopeConfig(0.015, format_color(ROPE_COLOR), settings.method)
 
 
 def scenario(condition: Condition, frequency: float, settings: Case1Settings) -> Scenario:

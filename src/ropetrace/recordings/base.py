@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ropetrace.errors import FrameError, RecordingError
-from ropetrace.types import BadFrame, CloudFrame, Intrinsics, RgbdFrame
+from ropetrace.types import Event, Intrinsics
 
 DEFAULT_PAIR_GAP = 0.02
 """Colour and depth that were taken farther apart than this are not of one moment, seconds."""
@@ -22,9 +22,6 @@ MAX_FILE_BYTES = 512 * 2**20
 
 MAX_TEXT_BYTES = 64 * 2**20
 """The largest text file that is read, bytes."""
-
-Event = RgbdFrame | CloudFrame | BadFrame
-"""What a recording yields."""
 
 
 @dataclass(frozen=True, slots=True)

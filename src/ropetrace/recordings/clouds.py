@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from ropetrace.errors import FrameError, MissingExtraError, RecordingError, import_extra
 from ropetrace.recordings.base import (
     MAX_FILE_BYTES,
-    Event,
     RecordingInfo,
     StampStatistics,
     natural_key,
@@ -31,7 +30,7 @@ from ropetrace.recordings.base import (
     read_file,
     stamp_at,
 )
-from ropetrace.types import MAX_IMAGE_PIXELS, BadFrame, CloudFrame
+from ropetrace.types import MAX_IMAGE_PIXELS, BadFrame, CloudFrame, Event
 
 Cloud = tuple[NDArray[Any], NDArray[np.uint8] | None]
 """Points (N, 3) and their colours (N, 3), if there are any."""

@@ -8,17 +8,9 @@ from pathlib import Path
 
 from ropetrace.errors import FrameError
 from ropetrace.recordings import images
-from ropetrace.recordings.base import (
-    Event,
-    RecordingInfo,
-    StampStatistics,
-    natural_key,
-    read_camera,
-    read_file,
-    stamp_at,
-)
+from ropetrace.recordings.base import RecordingInfo, StampStatistics, natural_key, read_camera, read_file, stamp_at
 from ropetrace.recordings.rgbd_folder import note_bad_images
-from ropetrace.types import BadFrame, RgbdFrame
+from ropetrace.types import BadFrame, Event, RgbdFrame
 
 
 class DepthFolder:

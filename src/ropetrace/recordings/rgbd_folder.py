@@ -27,7 +27,6 @@ from ropetrace.recordings import images
 from ropetrace.recordings.base import (
     DEFAULT_PAIR_GAP,
     MAX_TEXT_BYTES,
-    Event,
     RecordingInfo,
     StampStatistics,
     note,
@@ -35,7 +34,7 @@ from ropetrace.recordings.base import (
     read_file,
 )
 from ropetrace.recordings.pairing import missing_color, nearest
-from ropetrace.types import BadFrame, Intrinsics, RgbdFrame
+from ropetrace.types import BadFrame, Event, Intrinsics, RgbdFrame
 
 _STAMP = re.compile(r"([+-]?)([0-9]{1,10})(?:\.([0-9]{0,30}))?")
 

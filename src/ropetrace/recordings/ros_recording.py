@@ -8,11 +8,11 @@ from pathlib import Path
 
 from ropetrace.errors import FrameError, RecordingError
 from ropetrace.recordings import ros_messages
-from ropetrace.recordings.base import DEFAULT_PAIR_GAP, Event, RecordingInfo, StampStatistics, note, printable
+from ropetrace.recordings.base import DEFAULT_PAIR_GAP, RecordingInfo, StampStatistics, note, printable
 from ropetrace.recordings.pairing import Pairing
 from ropetrace.recordings.ros_messages import CAMERA, CLOUD, COMPRESSED, IMAGE, MessageSource, RawMessage
 from ropetrace.recordings.ros_topics import Choice, choose_topics, listed
-from ropetrace.types import BadFrame, CloudFrame, Intrinsics, RgbdFrame
+from ropetrace.types import BadFrame, CloudFrame, Event, Intrinsics, RgbdFrame
 
 Waiting = tuple[RawMessage, str | None]
 """A depth image, and what is wrong with its camera."""

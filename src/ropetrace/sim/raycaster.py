@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ropetrace.segmentation import LINEAR_OF_SRGB
 from ropetrace.sim.rays import box_hit, box_shape, capsule_cosine, capsule_hit, capsule_shape
 from ropetrace.sim.scene import FAR, NEAR, Plane, Scene
 from ropetrace.types import FloatArray, Intrinsics
@@ -86,7 +87,7 @@ class RayCaster:
         seen = scene.seen_from(world_from_camera)
         camera, capsules, boxes = self.intrinsics, seen.capsules, seen.boxes
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)
-        tables = (_SRGB_OF_LINEAR, _LINEAR_OF_SRGB)
+        tables = (_SRGB_OF_LINEAR, LINEAR_OF_SRGB)
         window = _cast_capsules(
             *buffers,
             lens,
@@ -124,27 +125,25 @@ def grown(window: Window, margin: int, shape: tuple[int, ...]) -> Window:
     return max(top - margin, 0), min(bottom + margin, shape[0]), max(left - margin, 0), min(right + margin, shape[1])
 
 
-def _srgb_tables() -> tuple[NDArray[np.uint8], FloatArray]:
-    """sRGB byte of 4096 steps of linear light, and linear light of each sRGB byte."""
+def _srgb_table() -> NDArray[np.uint8]:
+    """sRGB byte of 4096 steps of linear light."""
     linear = np.linspace(0, 1, 4096)
     byte = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    srgb = np.arange(256) / 255
-    light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return np.round(byte * 255).astype(np.uint8), light
+    return np.round(byte * 255).astype(np.uint8)
 
 
-_SRGB_OF_LINEAR, _LINEAR_OF_SRGB = _srgb_tables()
+_SRGB_OF_LINEAR = _srgb_table()
 
 
 def srgb_tables() -> tuple[NDArray[np.uint8], FloatArray]:
     """The (4096,) sRGB bytes of even steps of linear light, and the (256,) linear light of each byte, 0 to 1."""
-    return _SRGB_OF_LINEAR, _LINEAR_OF_SRGB
+    return _SRGB_OF_LINEAR, LINEAR_OF_SRGB
 
 
 def _shades(plane: Plane) -> NDArray[np.uint8]:
     """Colours of a plane, (_SHADES, 3), from edge-on to head-on."""
     brightness = _EDGE_BRIGHTNESS + (1 - _EDGE_BRIGHTNESS) * np.linspace(0, 1, _SHADES)
-    light = _LINEAR_OF_SRGB[list(plane.color)] * brightness[:, None]
+    light = LINEAR_OF_SRGB[list(plane.color)] * brightness[:, None]
     return _SRGB_OF_LINEAR[(light * 4095 + 0.5).astype(int)]
 
 

@@ -22,7 +22,7 @@ from ropetrace.sim.noise import noise_model
 from ropetrace.sim.rope import STEPS_PER_PERIOD, TIMESTEP, EndsAt, RopeModel, RopeSimulation, RopeState, Wind
 from ropetrace.sim.scene import Boxes, Capsules, Plane, Scene, check_camera_outside, inverse_pose, looking_at
 from ropetrace.sim.visibility import visible_fraction
-from ropetrace.types import FloatArray, RgbdFrame
+from ropetrace.types import FloatArray, RgbdFrame, moved
 
 ROPE, SECOND_ROPE, CLUTTER = 0, 1, 2
 """Labels of what is in a scene."""
@@ -268,7 +268,7 @@ class SimulatedScene:
         )
         return Truth(
             state,
-            state.polyline @ turn.T + self._camera_from_world[:3, 3],
+            moved(state.polyline, self._camera_from_world),
             np.asarray(Rotation.from_matrix(turn @ state.rotations).as_quat()),
             seen,
         )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ropetrace.errors import ConfigError
-from ropetrace.types import FloatArray
+from ropetrace.types import FloatArray, moved
 
 NEAR = 0.01
 """Surfaces nearer to the camera's plane than this are not seen, metres."""
@@ -282,4 +282,4 @@ def check_camera_outside(scene: Scene, world_from_camera: FloatArray | None = No
 
 
 def _moved(points: FloatArray, target_from_source: FloatArray) -> FloatArray:
-    return np.ascontiguousarray(points @ target_from_source[:3, :3].T + target_from_source[:3, 3])
+    return np.ascontiguousarray(moved(points, target_from_source))

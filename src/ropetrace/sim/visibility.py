@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ropetrace.sim.rays import box_hit, box_shape, capsule_hit, capsule_shape
 from ropetrace.sim.scene import FAR, NEAR, Scene, inverse_pose
-from ropetrace.types import FloatArray, Intrinsics
+from ropetrace.types import FloatArray, Intrinsics, moved
 
 _OWN_STRETCH = 3.0
 """How far along the rope, in radii, the surface that a ray meets may be from the sample it was sent to."""
@@ -53,8 +53,7 @@ def visible_samples(
     """
     seen = scene.seen_from(world_from_camera)
     if world_from_camera is not None:
-        camera_from_world = inverse_pose(world_from_camera)
-        points = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+        points = moved(points, inverse_pose(world_from_camera))
     planes = np.array([[*plane.normal, plane.distance] for plane in seen.planes], float).reshape(-1, 4)
     return _visible(
         np.ascontiguousarray(points, dtype=float),

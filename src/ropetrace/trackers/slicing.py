@@ -26,7 +26,6 @@ from ropetrace.trackers.doubts import Doubts
 from ropetrace.types import (
     BadFrame,
     Cloud,
-    CloudFrame,
     Estimate,
     FloatArray,
     Frame,
@@ -34,6 +33,7 @@ from ropetrace.types import (
     Slices,
     Status,
     Waypoints,
+    colors_of,
 )
 
 
@@ -80,11 +80,10 @@ class SlicingTracker:
         FrameError
             If colour is asked for and the frame has none, or the mask does not fit the frame.
         """
+        self._points, self._slices = np.empty((3, 0)), None
         if isinstance(frame, BadFrame):
-            self._points, self._slices = np.empty((3, 0)), None
             return Estimate.lost(frame.stamp_ns, frame.reason)
         reasons = self._doubts.of_stamp(frame.stamp_ns)
-        self._points, self._slices = np.empty((3, 0)), None
 
         points, count, stride = self.rope_points(frame)
         lap("segmentation")
@@ -147,7 +146,7 @@ class SlicingTracker:
         return self._points, count, stride
 
     def _require_color(self, frame: Frame) -> None:
-        color = frame.colors if isinstance(frame, CloudFrame) else frame.color
+        color = colors_of(frame)
         if color is None:
             raise FrameError("a colour is asked for, but the frame has none: leave out the colour, or record it")
         pixel = self.config.segmentation.color_pixel
