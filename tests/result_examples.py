@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ropetrace.types import Cloud, Estimate, Intrinsics, RgbdFrame, Status, Waypoints
+from ropetrace.types import Cloud, Estimate, Intrinsics, Motion, RgbdFrame, Status, Waypoints
 
 FIRST_STAMP = 1_700_000_000_123_456_789
 REASONS = ('a gap of 4 cm, "bridged"', "second line:\nnaïve – длина ≈ 3 m")
@@ -21,16 +21,31 @@ def helix(index: int, count: int = 50) -> Waypoints:
     return Waypoints(positions, np.asarray(quaternions), np.concatenate(([0.0], np.cumsum(steps))))
 
 
+def motion(index: int, count: int = 50) -> Motion:
+    """Of the helix that turns by 0.1 rad in 0.1 s; the sigmas differ from axis to axis and from array to array."""
+    angle = np.linspace(0, 6, count) + 0.1 * index
+    zero = np.zeros(count)
+    velocities = 0.1 * np.column_stack((-np.sin(angle), zero, np.cos(angle)))
+    accelerations = -0.1 * np.column_stack((np.cos(angle), zero, np.sin(angle)))
+    sigma = np.array([0.001, 0.002, 0.003]) * np.linspace(1, 2, count)[:, None]
+    return Motion(velocities, accelerations, sigma, 7 * sigma, 61 * sigma)
+
+
 def estimate(index: int) -> Estimate:
-    """Every 5th frame from the 4th on is lost, every 5th from the 3rd on is degraded."""
+    """Every 5th frame from the 4th on is lost, every 5th from the 3rd on is degraded.
+
+    The motion is not known in the first frame and after a lost one; every 3rd frame is predicted, 25 ms ahead.
+    """
     stamp_ns = FIRST_STAMP + index * 33_333_333
     if index % 5 == 4:
         return Estimate.lost(stamp_ns, "too few points (3 < 25)", point_count=3)
     waypoints = helix(index)
     nodes = waypoints.positions[:: 7 + index % 3]
+    moving = motion(index) if index % 5 else None
+    ahead_ns = 25_000_000 if index % 3 == 1 else 0
     if index % 5 == 3:
-        return Estimate(stamp_ns, Status.DEGRADED, REASONS, nodes, waypoints, 900)
-    return Estimate(stamp_ns, Status.OK, (), nodes, waypoints, 1000 + index)
+        return Estimate(stamp_ns, Status.DEGRADED, REASONS, nodes, waypoints, 900, 1, moving, ahead_ns)
+    return Estimate(stamp_ns, Status.OK, (), nodes, waypoints, 1000 + index, 1, moving, ahead_ns)
 
 
 def estimates(count: int) -> list[Estimate]:

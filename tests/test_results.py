@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import os
 import resource
@@ -19,17 +20,17 @@ import pyarrow.parquet
 import pytest
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from mcap.records import Message
+from mcap.records import Channel, DataEnd, Message
 from mcap.stream_reader import StreamReader
 from rerun.chunk import RrdReader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from result_examples import FIRST_STAMP, REASONS, cloud, estimate, estimates, frame
+from result_examples import FIRST_STAMP, REASONS, cloud, estimate, estimates, frame, helix, motion
 from ropetrace.errors import MissingExtraError, OutputError
 from ropetrace.results import FORMATS, checkpoint, open_writer
-from ropetrace.results.base import COLUMNS, FLOAT_COLUMNS, uninterrupted
-from ropetrace.types import Estimate
+from ropetrace.results.base import COLUMNS, FLOAT_COLUMNS, MOTION_ARRAYS, float_rows, motion_rows, uninterrupted
+from ropetrace.types import Estimate, Motion, Status
 
 ENDINGS = list(FORMATS)
 METADATA = {"config": 'diameter = 0.012\ncolor = "#c8281e"\n', "note": "naïve ≈ длина"}
@@ -52,18 +53,33 @@ def record(path: Path, items: list[Estimate], **options: Any) -> None:
 def expected_rows(items: list[Estimate]) -> list[tuple[Any, ...]]:
     rows: list[tuple[Any, ...]] = []
     for index, item in enumerate(items):
-        waypoints = item.waypoints
+        waypoints, moving = item.waypoints, item.motion
+        start, status = (10 + index, item.stamp_ns, item.ahead_ns), str(item.status)
         if not len(waypoints):
-            rows.append((10 + index, item.stamp_ns, None, str(item.status), *[None] * len(FLOAT_COLUMNS)))
-        values = zip(
-            waypoints.arc_length.tolist(),
-            waypoints.positions.tolist(),
-            waypoints.quaternions.tolist(),
-            strict=True,
-        )
-        for number, (arc_length, position, quaternion) in enumerate(values):
-            rows.append((10 + index, item.stamp_ns, number, str(item.status), arc_length, *position, *quaternion))
+            rows.append((*start, None, status, *[None] * len(FLOAT_COLUMNS)))
+        for number in range(len(waypoints)):
+            row: list[Any] = [
+                waypoints.arc_length[number],
+                *waypoints.positions[number],
+                *waypoints.quaternions[number],
+            ]
+            if moving is None:
+                row += [None] * 15
+            else:
+                row += [*moving.velocities[number], *moving.accelerations[number]]
+                row += [*moving.position_sigma[number], *moving.velocity_sigma[number]]
+                row += [*moving.acceleration_sigma[number]]
+            rows.append((*start, number, status, *row))
     return rows
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def nanoseconds(time: Any) -> int:
+    """A ROS time or duration as one number."""
+    return int(time.sec * 10**9 + time.nanosec)
 
 
 def rrd_frames(path: Path) -> set[int]:
@@ -97,9 +113,8 @@ def mcap_messages(path: Path, finished: bool) -> Iterator[tuple[int, Any]]:
 def frames_in(path: Path, finished: bool = True) -> list[int]:
     """The numbers of the frames that can be read from a file of any format."""
     if path.suffix == ".csv":
-        text = path.read_text()
-        assert text.endswith("\n")
-        return sorted({int(row["frame"]) for row in csv.DictReader(text.splitlines())})
+        assert path.read_text().endswith("\n")
+        return sorted({int(row["frame"]) for row in read_csv(path)})
     if path.suffix == ".parquet":
         return sorted(set(pyarrow.parquet.read_table(path)["frame"].to_pylist()))
     if path.suffix == ".npz":
@@ -116,8 +131,11 @@ def test_csv_is_exact(tmp_path: Path) -> None:
     text = (tmp_path / "run.csv").read_bytes().decode()
     assert "\r" not in text
     header, *rows = csv.reader(text.splitlines())
-    assert ",".join(header) == "frame,stamp_ns,waypoint,status,arc_length,x,y,z,qx,qy,qz,qw"
-    kinds = (int, int, int, str, *[float] * 8)
+    assert ",".join(header) == (
+        "frame,stamp_ns,ahead_ns,waypoint,status,arc_length,x,y,z,qx,qy,qz,qw,vx,vy,vz,ax,ay,az,"
+        "sigma_x,sigma_y,sigma_z,sigma_vx,sigma_vy,sigma_vz,sigma_ax,sigma_ay,sigma_az"
+    )
+    kinds = (int, int, int, int, str, *[float] * 23)
     read = [tuple(kind(cell) if cell else None for kind, cell in zip(kinds, row, strict=True)) for row in rows]
     assert read == expected_rows(items)
 
@@ -132,6 +150,38 @@ def test_parquet_is_exact(tmp_path: Path) -> None:
     assert kept == {**METADATA, "frame_name": "world"}
 
 
+@pytest.mark.parametrize("ending", [".csv", ".parquet"])
+def test_a_number_that_is_not_known_is_empty(tmp_path: Path, ending: str) -> None:
+    """Also where a part of the motion is known."""
+    known = motion(1, 3)
+    accelerations = known.accelerations.copy()
+    accelerations[1] = np.nan
+    moving = dataclasses.replace(known, accelerations=accelerations)
+    path = tmp_path / f"run{ending}"
+    record(path, [Estimate(1, Status.OK, waypoints=helix(1, 3), motion=moving)])
+    rows: list[dict[str, Any]]
+    if ending == ".csv":
+        assert "nan" not in path.read_text()
+        rows = [{k: float(v) if v else None for k, v in row.items() if k != "status"} for row in read_csv(path)]
+    else:
+        rows = pyarrow.parquet.read_table(path).to_pylist()
+    assert [row["ax"] for row in rows] == [known.accelerations[0, 0], None, known.accelerations[2, 0]]
+    assert [row["az"] for row in rows] == [known.accelerations[0, 2], None, known.accelerations[2, 2]]
+    assert [row["sigma_az"] for row in rows] == known.acceleration_sigma[:, 2].tolist()
+
+
+def test_the_motion_is_one_block_for_all_formats() -> None:
+    assert tuple(item.name for item in dataclasses.fields(Motion)) == MOTION_ARRAYS
+    known, unknown, lost = estimate(1), estimate(0), estimate(4)
+    assert known.motion is not None
+    block = motion_rows(known)
+    for index, name in enumerate(MOTION_ARRAYS):
+        assert np.array_equal(block[:, 3 * index : 3 * index + 3], getattr(known.motion, name))
+    assert np.isnan(motion_rows(unknown)).all()
+    assert (motion_rows(unknown).shape, motion_rows(lost).shape) == ((50, 15), (0, 15))
+    assert (float_rows(known).shape, float_rows(lost).shape) == ((50, 23), (0, 23))
+
+
 def test_npz_is_exact(tmp_path: Path) -> None:
     items = estimates(10)
     record(tmp_path / "run.npz", items, metadata=METADATA)
@@ -139,6 +189,7 @@ def test_npz_is_exact(tmp_path: Path) -> None:
         read = dict(arrays)
     assert read["frame"].tolist() == list(range(10, 20))
     assert read["stamp_ns"].tolist() == [item.stamp_ns for item in items]
+    assert read["ahead_ns"].tolist() == [item.ahead_ns for item in items]
     assert read["status"].tolist() == [str(item.status) for item in items]
     assert read["reasons"].tolist() == ["\n".join(item.reasons) for item in items]
     assert read["point_count"].tolist() == [item.point_count for item in items]
@@ -149,7 +200,10 @@ def test_npz_is_exact(tmp_path: Path) -> None:
         assert np.array_equal(read["positions"][part], item.waypoints.positions)
         assert np.array_equal(read["quaternions"][part], item.waypoints.quaternions)
         assert np.array_equal(read["arc_length"][part], item.waypoints.arc_length)
-    assert len(read["positions"]) == waypoints[-1]
+        for name in MOTION_ARRAYS:
+            expected = np.full((len(item.waypoints), 3), np.nan) if item.motion is None else getattr(item.motion, name)
+            assert np.array_equal(read[name][part], expected, equal_nan=True)
+    assert {len(read[name]) for name in ("positions", *MOTION_ARRAYS)} == {waypoints[-1]}
     assert json.loads(str(read["metadata"])) == {**METADATA, "frame_name": "camera"}
 
 
@@ -157,16 +211,16 @@ def test_npz_is_exact(tmp_path: Path) -> None:
 def test_mcap_is_read_by_rosbags(tmp_path: Path, frame_name: str, frame_id: str) -> None:
     items = estimates(10)
     record(tmp_path / "run.mcap", items, frame_name=frame_name)
-    paths: list[tuple[int, Any]] = []
-    statuses: list[tuple[int, Any]] = []
+    read: dict[str, list[Any]] = {"centerline": [], "motion": [], "status": []}
     with AnyReader([tmp_path / "run.mcap"]) as reader:
         for connection, time_ns, data in reader.messages():
             message: Any = reader.deserialize(data, connection.msgtype)
-            stamp = message.header.stamp
-            assert (stamp.sec * 10**9 + stamp.nanosec, message.header.frame_id) == (time_ns, frame_id)
-            (paths if connection.topic == "/ropetrace/centerline" else statuses).append((time_ns, message))
-    assert [time_ns for time_ns, _ in paths] == [time_ns for time_ns, _ in statuses] == [i.stamp_ns for i in items]
-    for item, (_, path), (_, array) in zip(items, paths, statuses, strict=True):
+            assert message.header.frame_id == frame_id
+            read[connection.topic.removeprefix("/ropetrace/")].append(message)
+            assert time_ns == items[len(read["centerline"]) - 1].stamp_ns
+    for item, path, moving, array in zip(items, *read.values(), strict=True):
+        assert nanoseconds(array.header.stamp) == item.stamp_ns
+        assert nanoseconds(path.header.stamp) == nanoseconds(moving.header.stamp) == item.stamp_ns + item.ahead_ns
         poses = [pose.pose for pose in path.poses]
         positions = [(pose.position.x, pose.position.y, pose.position.z) for pose in poses]
         turns = [(p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w) for p in poses]
@@ -178,7 +232,35 @@ def test_mcap_is_read_by_rosbags(tmp_path: Path, frame_name: str, frame_id: str)
         values = {pair.key: pair.value for pair in status.values}
         assert (values["point_count"], values["nodes"]) == (str(item.point_count), str(len(item.nodes)))
         assert float(values["length"]) == item.waypoints.length
-    assert statuses[3][1].status[0].message == "; ".join(REASONS)
+        assert float(values["ahead"]) == item.ahead_ns / 1e9
+    assert read["status"][3].status[0].message == "; ".join(REASONS)
+
+
+def test_mcap_has_the_motion_of_every_waypoint(tmp_path: Path) -> None:
+    items = estimates(5)
+    record(tmp_path / "run.mcap", items)
+    with AnyReader([tmp_path / "run.mcap"]) as reader:
+        connections = [c for c in reader.connections if c.topic == "/ropetrace/motion"]
+        assert [c.msgtype for c in connections] == ["trajectory_msgs/msg/MultiDOFJointTrajectory"]
+        messages: list[Any] = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(connections)]
+
+    def rows(vectors: list[Any]) -> list[list[float]]:
+        return [[vector.x, vector.y, vector.z] for vector in vectors]
+
+    for item, message in zip(items, messages, strict=True):
+        if item.motion is None:
+            assert (message.points, message.joint_names) == ([], [])
+            continue
+        assert message.joint_names == [f"waypoint_{number}" for number in range(50)]
+        (point,) = message.points
+        assert nanoseconds(point.time_from_start) == 0
+        assert rows([pose.translation for pose in point.transforms]) == item.waypoints.positions.tolist()
+        turns = [[turn.x, turn.y, turn.z, turn.w] for turn in (pose.rotation for pose in point.transforms)]
+        assert turns == item.waypoints.quaternions.tolist()
+        assert rows([twist.linear for twist in point.velocities]) == item.motion.velocities.tolist()
+        assert rows([twist.linear for twist in point.accelerations]) == item.motion.accelerations.tolist()
+        assert not np.any(rows([twist.angular for twist in point.velocities + point.accelerations]))
+    assert [item.motion is None for item in items] == [True, False, False, False, True]
 
 
 def test_mcap_has_checksums_schemas_and_metadata(tmp_path: Path) -> None:
@@ -188,11 +270,14 @@ def test_mcap_has_checksums_schemas_and_metadata(tmp_path: Path) -> None:
         summary = reader.get_summary()
         assert summary is not None
         assert summary.statistics is not None
-        assert summary.statistics.message_count == 20
+        assert summary.statistics.message_count == 30
         assert reader.get_header().profile == "ros2"
         assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
         texts = {schema.name: schema.data.decode() for schema in summary.schemas.values()}
         assert "MSG: geometry_msgs/PoseStamped" in texts["nav_msgs/msg/Path"]
+        assert (
+            "MSG: trajectory_msgs/MultiDOFJointTrajectoryPoint" in texts["trajectory_msgs/msg/MultiDOFJointTrajectory"]
+        )
         assert "MSG: diagnostic_msgs/KeyValue" in texts["diagnostic_msgs/msg/DiagnosticArray"]
         assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
         (metadata,) = reader.iter_metadata()
@@ -201,15 +286,22 @@ def test_mcap_has_checksums_schemas_and_metadata(tmp_path: Path) -> None:
 
 
 def test_no_flipped_bit_of_an_mcap_changes_data(tmp_path: Path) -> None:
+    """Read from its start to the end of the data: no reader of the package `mcap` checks the index behind them."""
     path, broken = tmp_path / "run.mcap", tmp_path / "broken.mcap"
     record(path, estimates(5))
 
     def read(path: Path) -> list[tuple[str, int, int, bytes]]:
+        topics: dict[int, str] = {}
+        messages = []
         with path.open("rb") as file:
-            return [
-                (channel.topic, message.sequence, message.log_time, message.data)
-                for _, channel, message in make_reader(file, validate_crcs=True).iter_messages()
-            ]
+            for item in StreamReader(file, validate_crcs=True).records:
+                if isinstance(item, DataEnd):
+                    break
+                if isinstance(item, Channel):
+                    topics[item.id] = item.topic
+                if isinstance(item, Message):
+                    messages.append((topics[item.channel_id], item.sequence, item.log_time, item.data))
+        return messages
 
     sound, data = read(path), path.read_bytes()
     random = np.random.default_rng(0)
@@ -233,6 +325,15 @@ def test_mcap_refuses_a_stamp_that_ros_cannot_hold(tmp_path: Path, stamp_ns: int
         with pytest.raises(OutputError, match=f"frame 7: the stamp {stamp_ns} ns does not fit"):
             writer.write(7, Estimate.lost(stamp_ns, "nothing"))
         writer.write(8, Estimate.lost(0, "nothing"))
+    assert len(frames_in(tmp_path / "run.mcap")) == 1
+
+
+def test_mcap_refuses_a_prediction_that_ros_cannot_hold(tmp_path: Path) -> None:
+    late = dataclasses.replace(estimate(1), stamp_ns=2**31 * 10**9 - 1, ahead_ns=1)
+    with open_writer(tmp_path / "run.mcap") as writer:
+        with pytest.raises(OutputError, match=f"frame 7: the predicted time {2**31 * 10**9} ns does not fit"):
+            writer.write(7, late)
+        writer.write(8, dataclasses.replace(late, ahead_ns=0))
     assert len(frames_in(tmp_path / "run.mcap")) == 1
 
 
@@ -462,4 +563,6 @@ def test_checkpoints_take_little_time(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_the_stamps_are_nanoseconds(tmp_path: Path) -> None:
     record(tmp_path / "run.csv", estimates(1))
-    assert (tmp_path / "run.csv").read_text().splitlines()[1].startswith(f"10,{FIRST_STAMP},0,ok,0.0,")
+    assert (tmp_path / "run.csv").read_text().splitlines()[1].startswith(f"10,{FIRST_STAMP},0,0,ok,0.0,")
+    record(tmp_path / "ahead.csv", [estimate(1)])
+    assert read_csv(tmp_path / "ahead.csv")[0]["ahead_ns"] == "25000000"

@@ -12,7 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from helpers import random_rotation
 from ropetrace.errors import FrameError
-from ropetrace.types import Cloud, CloudFrame, Estimate, Intrinsics, RgbdFrame, Status, Waypoints, coordinate_buffer
+from ropetrace.types import (
+    Cloud,
+    CloudFrame,
+    Estimate,
+    Intrinsics,
+    Motion,
+    RgbdFrame,
+    Status,
+    Waypoints,
+    coordinate_buffer,
+)
 
 CAMERA = Intrinsics(8, 6, 10.0, 10.0, 3.5, 2.5)
 DEPTH = np.zeros((6, 8), np.uint16)
@@ -132,6 +142,36 @@ def test_waypoints_in_another_frame() -> None:
         )
         assert ((moved.quaternions[1:] * moved.quaternions[:-1]).sum(axis=1) > 0).all()
         assert moved.length == waypoints.length == 1.0
+
+
+def test_a_motion_of_other_shapes_is_refused() -> None:
+    rows = np.zeros((4, 3))
+    assert len(Motion(rows, rows, rows, rows, rows)) == 4
+    with pytest.raises(ValueError, match=r"motion: shapes .*\(4, 3\), \(5, 3\).* do not fit, expected \(W, 3\)"):
+        Motion(rows, rows, rows, rows, np.zeros((5, 3)))
+    with pytest.raises(ValueError, match="do not fit"):
+        Motion(*[np.zeros((4, 2))] * 5)
+    with pytest.raises(ValueError, match="do not fit"):
+        Motion(*[np.zeros(3)] * 5)
+    with pytest.raises(ValueError, match="estimate: 0 waypoints, but the motion of 4"):
+        Estimate(0, Status.OK, motion=Motion(rows, rows, rows, rows, rows))
+
+
+def test_a_motion_in_another_frame() -> None:
+    """Its sigmas are the square roots of the diagonals of covariances that turn."""
+    rng = np.random.default_rng(0)
+    motion = Motion(rng.normal(size=(20, 3)), rng.normal(size=(20, 3)), *rng.random((3, 20, 3)))
+    for _ in range(20):
+        transform = np.eye(4)
+        transform[:3, :3], transform[:3, 3] = random_rotation(rng), rng.uniform(-3, 3, 3)
+        turn = transform[:3, :3]
+        turned = motion.rotated(transform)
+        for name in ("velocities", "accelerations"):
+            expected = [turn @ row for row in getattr(motion, name)]
+            np.testing.assert_allclose(getattr(turned, name), expected, atol=1e-14)
+        for name in ("position_sigma", "velocity_sigma", "acceleration_sigma"):
+            expected = [np.sqrt(np.diag(turn @ np.diag(row**2) @ turn.T)) for row in getattr(motion, name)]
+            np.testing.assert_allclose(getattr(turned, name), expected, atol=1e-14)
 
 
 def test_a_lost_estimate_has_nothing_but_its_reason() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 import time
@@ -13,12 +14,20 @@ import pyarrow
 import pytest
 from rerun.chunk import RrdReader
 
-from result_examples import FIRST_STAMP, REASONS, cloud, estimate, frame
+from result_examples import FIRST_STAMP, REASONS, cloud, estimate, frame, helix, motion
 from ropetrace.errors import OutputError
 from ropetrace.results import live, open_writer
 from ropetrace.results.live import LiveViewer
-from ropetrace.types import Cloud, CloudFrame, Estimate, Frame
-from ropetrace.viewer import AXES, CLOUD_POINTS, IMAGE_WIDTH, NO_NODE_COLOR, NODE_COLORS
+from ropetrace.types import Cloud, CloudFrame, Estimate, Frame, Status, Waypoints
+from ropetrace.viewer import (
+    AXES,
+    CLOUD_POINTS,
+    IMAGE_WIDTH,
+    NO_NODE_COLOR,
+    NODE_COLORS,
+    VELOCITY_COLOR,
+    VELOCITY_SECONDS,
+)
 
 Rows = dict[str, dict[int | None, dict[str, Any]]]
 
@@ -52,8 +61,8 @@ def rgb(values: list[int]) -> list[tuple[int, ...]]:
 
 
 def test_every_picture_of_a_frame_is_there(path: Path) -> None:
-    item = estimate(0)
-    rows = logged(path, (item, frame(0), cloud(0)), metadata={"config": "diameter = 0.012"})
+    item = estimate(1)
+    rows = logged(path, (item, frame(1), cloud(1)), metadata={"config": "diameter = 0.012"})
     assert {
         "/",
         "/camera",
@@ -64,8 +73,10 @@ def test_every_picture_of_a_frame_is_there(path: Path) -> None:
         "/rope/nodes",
         "/rope/centerline",
         "/rope/axes",
+        "/rope/velocity",
         "/status",
         "/plots/length",
+        "/plots/speed",
         "/plots/point_count",
         "/metadata/config",
     } <= set(rows)
@@ -96,6 +107,37 @@ def test_a_lost_frame_clears_the_rope(path: Path) -> None:
     # What was segmented is what one wants to see then.
     assert 4 in rows["/rope/cloud"]
     assert rows["/plots/length"][4]["Scalars:scalars"] == [0.0]
+
+
+def test_arrows_point_where_the_rope_moves(path: Path) -> None:
+    item = Estimate(FIRST_STAMP, Status.OK, waypoints=helix(1, 100), motion=motion(1, 100))
+    rows = logged(path, (item, None, None))
+    row = rows["/rope/velocity"][0]
+    assert item.motion is not None
+    step = 9
+    assert 100 / step <= AXES
+    assert np.allclose(row["Arrows3D:origins"], item.waypoints.positions[::step], atol=1e-6)
+    assert np.allclose(row["Arrows3D:vectors"], VELOCITY_SECONDS * item.motion.velocities[::step], atol=1e-6)
+    assert rgb(row["Arrows3D:colors"]) == [VELOCITY_COLOR]
+    # Each at a waypoint that has its axes.
+    assert np.array_equal(rows["/rope/axes"][0]["Arrows3D:origins"][::3], row["Arrows3D:origins"])
+
+
+def test_the_speed_is_that_of_the_fastest_waypoint(path: Path) -> None:
+    velocities = np.zeros((50, 3))
+    velocities[7], velocities[20] = [0.0, -3.0, 4.0], [4.5, 0.0, 0.0]
+    item = dataclasses.replace(estimate(1), motion=dataclasses.replace(motion(1), velocities=velocities))
+    rows = logged(path, (item, None, None))
+    assert rows["/plots/speed"][0]["Scalars:scalars"] == [5.0]
+
+
+def test_a_motion_that_is_not_known_is_not_drawn(path: Path) -> None:
+    nothing = Estimate(FIRST_STAMP, Status.LOST, waypoints=Waypoints.none(), motion=motion(0, 0))
+    rows = logged(path, *((estimate(index), None, None) for index in range(6)), (nothing, None, None))
+    assert set(rows["/rope/velocity"]) == {1, 2, 3}
+    speeds = rows["/plots/speed"]
+    assert {index for index, row in speeds.items() if row.get("Scalars:scalars")} == {1, 2, 3}
+    assert {index for index, row in speeds.items() if row.get("Clear:is_recursive") == [False]} == {0, 4, 5, 6}
 
 
 def test_a_frame_without_an_image_clears_the_image(path: Path) -> None:

@@ -7,7 +7,7 @@ Quaternions are ``xyzw``. Stamps are integer nanoseconds.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Any
 
@@ -244,6 +244,50 @@ class Waypoints:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """How waypoints move: arrays of (W, 3), a row for each waypoint, in the frame of the waypoints.
+
+    Parameters
+    ----------
+    velocities : (W, 3) float array
+        m/s, of the points of the rope that the waypoints are: what moves along the rope counts.
+    accelerations : (W, 3) float array
+        m/s^2.
+    position_sigma, velocity_sigma, acceleration_sigma : (W, 3) float array
+        Standard deviations of the waypoints' positions, velocities and accelerations along the axes of the frame.
+    """
+
+    velocities: FloatArray
+    accelerations: FloatArray
+    position_sigma: FloatArray
+    velocity_sigma: FloatArray
+    acceleration_sigma: FloatArray
+
+    def __post_init__(self) -> None:
+        shapes = {getattr(self, item.name).shape for item in fields(self)}
+        if len(shapes) > 1 or self.velocities.ndim != 2 or self.velocities.shape[1] != 3:
+            raise ValueError(f"motion: shapes {sorted(shapes)} do not fit, expected (W, 3)")
+
+    def __len__(self) -> int:
+        return len(self.velocities)
+
+    def rotated(self, target_from_source: FloatArray) -> Motion:
+        """The same motion in another frame that does not move, by a (4, 4) rigid transform."""
+        turn = target_from_source[:3, :3]
+
+        def spread(sigma: FloatArray) -> FloatArray:
+            return np.asarray(np.sqrt(sigma**2 @ (turn**2).T))
+
+        return Motion(
+            self.velocities @ turn.T,
+            self.accelerations @ turn.T,
+            spread(self.position_sigma),
+            spread(self.velocity_sigma),
+            spread(self.acceleration_sigma),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """What a tracker says of one frame.
 
@@ -263,6 +307,10 @@ class Estimate:
         Points of the frame that the segmentation took for the rope.
     point_stride : int
         1 where all of them were used; k where the cap on points kept every k-th.
+    motion : Motion, optional
+        Of the waypoints; None where it is not known, as in the first frame.
+    ahead_ns : int
+        The waypoints and their motion are predicted for this long after the stamp, nanoseconds; nodes never are.
     """
 
     stamp_ns: int
@@ -272,6 +320,12 @@ class Estimate:
     waypoints: Waypoints = field(default_factory=Waypoints.none)
     point_count: int = 0
     point_stride: int = 1
+    motion: Motion | None = None
+    ahead_ns: int = 0
+
+    def __post_init__(self) -> None:
+        if self.motion is not None and len(self.motion) != len(self.waypoints):
+            raise ValueError(f"estimate: {len(self.waypoints)} waypoints, but the motion of {len(self.motion)}")
 
     @classmethod
     def lost(cls, stamp_ns: int, reason: str, point_count: int = 0) -> Estimate:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ropetrace.errors import import_extra
-from ropetrace.types import Cloud, CloudFrame, Estimate, FloatArray, Frame, RgbdFrame, Status, Waypoints
+from ropetrace.types import Cloud, CloudFrame, Estimate, FloatArray, Frame, Motion, RgbdFrame, Status, Waypoints
 
 rr: Any = import_extra("rerun", "viewer")
 rrb: Any = import_extra("rerun.blueprint", "viewer")
@@ -19,7 +19,12 @@ IMAGE_WIDTH = 640
 """Wider images are thinned to at most this many columns: they are looked at, not measured."""
 
 AXES = 12
-"""About how many waypoint frames are drawn; more would hide the rope."""
+"""About how many waypoint frames, and velocities, are drawn; more would hide the rope."""
+
+VELOCITY_SECONDS = 0.1
+"""An arrow of a velocity is as long as the way of its waypoint in this time: 1 m/s is 0.1 m."""
+
+VELOCITY_COLOR = (255, 70, 255)
 
 SCENE_POINTS = 50_000
 """About how many points of a whole cloud are drawn."""
@@ -75,6 +80,7 @@ def default_blueprint() -> Any:
                 ),
                 rrb.Horizontal(
                     rrb.TimeSeriesView(name="Length (m)", origin="/plots/length"),
+                    rrb.TimeSeriesView(name="Speed (m/s)", origin="/plots/speed"),
                     rrb.TimeSeriesView(name="Points", origin="/plots/point_count"),
                 ),
                 rrb.TextLogView(name="Status", origin="/status"),
@@ -91,8 +97,8 @@ class RerunLog:
     """Logs a run to a Rerun recording, on the timelines ``frame`` (its index) and ``time`` (its stamp).
 
     The entities are ``/camera`` with ``image`` (the colour; the depth, if that is all) and ``depth``;
-    ``/scene``, a frame's whole cloud; ``/rope`` with ``cloud``, ``nodes``, ``centerline`` and ``axes``;
-    ``/status``; ``/plots`` with ``length`` and ``point_count``.
+    ``/scene``, a frame's whole cloud; ``/rope`` with ``cloud``, ``nodes``, ``centerline``, ``axes`` and
+    ``velocity``; ``/status``; ``/plots`` with ``length``, ``speed`` (of the fastest waypoint) and ``point_count``.
 
     Parameters
     ----------
@@ -217,10 +223,13 @@ class RerunLog:
                 ),
             )
             self._recording.log("rope/axes", _axes(estimate.waypoints))
+            if estimate.motion is not None:
+                self._recording.log("rope/velocity", _velocity(estimate.waypoints, estimate.motion))
 
     def _log_status(self, estimate: Estimate) -> None:
         self._recording.log("plots/length", rr.Scalars(estimate.waypoints.length))
         self._recording.log("plots/point_count", rr.Scalars(estimate.point_count))
+        self._recording.log("plots/speed", _speed(estimate))
         if self._reported == (estimate.status, estimate.reasons):
             return
         self._reported = (estimate.status, estimate.reasons)
@@ -231,9 +240,14 @@ class RerunLog:
         )
 
 
+def _step(waypoints: Waypoints) -> int:
+    """Which waypoints get arrows: every so many."""
+    return -(-len(waypoints) // AXES)
+
+
 def _axes(waypoints: Waypoints) -> Any:
     """Arrows for the frames of about `AXES` waypoints: X (along the rope) red, Y green, Z blue."""
-    step = -(-len(waypoints) // AXES)
+    step = _step(waypoints)
     positions = waypoints.positions[::step]
     size = max(0.6 * waypoints.length / AXES, 0.002)
     # The columns of a rotation matrix are the frame's axes.
@@ -244,3 +258,21 @@ def _axes(waypoints: Waypoints) -> Any:
         colors=np.tile(np.array([(255, 60, 60), (60, 200, 60), (70, 110, 255)], np.uint8), (len(positions), 1)),
         radii=rr.Radius.ui_points(1.5),
     )
+
+
+def _velocity(waypoints: Waypoints, motion: Motion) -> Any:
+    """Arrows for the velocities of about `AXES` waypoints."""
+    step = _step(waypoints)
+    return rr.Arrows3D(
+        origins=waypoints.positions[::step],
+        vectors=VELOCITY_SECONDS * motion.velocities[::step],
+        colors=VELOCITY_COLOR,
+        radii=rr.Radius.ui_points(2.0),
+    )
+
+
+def _speed(estimate: Estimate) -> Any:
+    """The speed of the fastest waypoint; a gap in the plot where it is not known."""
+    if estimate.motion is None or not len(estimate.motion):
+        return rr.Clear(recursive=False)
+    return rr.Scalars(np.linalg.norm(estimate.motion.velocities, axis=1).max())

@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ropetrace.results.base import Closing
+from ropetrace.results.base import MOTION_ARRAYS, Closing, motion_rows
 from ropetrace.results.checkpoint import Checkpoint
 from ropetrace.types import Cloud, Estimate, Frame
 
@@ -18,11 +18,11 @@ from ropetrace.types import Cloud, Estimate, Frame
 class NpzWriter(Closing):
     """Arrays that ``numpy.load(path, allow_pickle=False)`` reads.
 
-    One entry a frame, F in all: ``frame``, ``stamp_ns``, ``status``, ``reasons`` (one a line) and
+    One entry a frame, F in all: ``frame``, ``stamp_ns``, ``ahead_ns``, ``status``, ``reasons`` (one a line) and
     ``point_count``. All frames end to end: ``nodes (sum M, 3)``, ``positions (sum W, 3)``, ``quaternions
-    (sum W, 4)`` and ``arc_length (sum W,)``. ``node_offset`` and ``waypoint_offset`` have F + 1 entries: the
-    waypoints of frame i are ``positions[waypoint_offset[i]:waypoint_offset[i + 1]]``. ``metadata`` is a JSON
-    text, ``frame_name`` in it.
+    (sum W, 4)``, ``arc_length (sum W,)`` and the arrays of `Motion`, ``(sum W, 3)`` each, NaN where the motion is
+    not known. ``node_offset`` and ``waypoint_offset`` have F + 1 entries: the waypoints of frame i are
+    ``positions[waypoint_offset[i]:waypoint_offset[i + 1]]``. ``metadata`` is a JSON text, ``frame_name`` in it.
 
     Raises
     ------
@@ -32,7 +32,7 @@ class NpzWriter(Closing):
 
     def __init__(self, path: Path, *, overwrite: bool, frame_name: str, metadata: Mapping[str, str]) -> None:
         self._metadata = json.dumps({**metadata, "frame_name": frame_name}, ensure_ascii=False)
-        self._frames: list[tuple[int, int, str, str, int]] = []
+        self._frames: list[tuple[int, int, int, str, str, int]] = []
         self._node_offset = [0]
         self._waypoint_offset = [0]
         self._parts: dict[str, list[NDArray[Any]]] = {
@@ -40,6 +40,7 @@ class NpzWriter(Closing):
             "positions": [np.empty((0, 3))],
             "quaternions": [np.empty((0, 4))],
             "arc_length": [np.empty(0)],
+            **{name: [np.empty((0, 3))] for name in MOTION_ARRAYS},
         }
         self._closed = False
         self._checkpoint = Checkpoint(path, overwrite, self._save)
@@ -50,6 +51,7 @@ class NpzWriter(Closing):
             (
                 index,
                 estimate.stamp_ns,
+                estimate.ahead_ns,
                 str(estimate.status),
                 "\n".join(estimate.reasons),
                 estimate.point_count,
@@ -61,6 +63,8 @@ class NpzWriter(Closing):
         self._parts["positions"].append(waypoints.positions)
         self._parts["quaternions"].append(waypoints.quaternions)
         self._parts["arc_length"].append(waypoints.arc_length)
+        for name, part in zip(MOTION_ARRAYS, np.hsplit(motion_rows(estimate), len(MOTION_ARRAYS)), strict=True):
+            self._parts[name].append(part)
         self._checkpoint.write_if_due()
 
     def close(self) -> None:
@@ -71,11 +75,13 @@ class NpzWriter(Closing):
     def _save(self, file: BinaryIO) -> None:
         for name, parts in self._parts.items():
             self._parts[name] = [np.concatenate(parts)]
-        frame, stamp_ns, status, reasons, point_count = zip(*self._frames, strict=True) if self._frames else ((),) * 5
+        per_frame = zip(*self._frames, strict=True) if self._frames else ((),) * 6
+        frame, stamp_ns, ahead_ns, status, reasons, point_count = per_frame
         np.savez(
             file,
             frame=np.array(frame, np.int64),
             stamp_ns=np.array(stamp_ns, np.int64),
+            ahead_ns=np.array(ahead_ns, np.int64),
             status=np.array(status, np.str_),
             reasons=np.array(reasons, np.str_),
             point_count=np.array(point_count, np.int64),

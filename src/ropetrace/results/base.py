@@ -10,17 +10,44 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import BinaryIO, Protocol, Self
 
-from ropetrace.errors import OutputError
-from ropetrace.types import Cloud, Estimate, Frame
+import numpy as np
 
-STATUS_COLUMNS = ("frame", "stamp_ns", "waypoint", "status")
+from ropetrace.errors import OutputError
+from ropetrace.types import Cloud, Estimate, FloatArray, Frame
+
+STATUS_COLUMNS = ("frame", "stamp_ns", "ahead_ns", "waypoint", "status")
 """The columns of a row that say what it belongs to."""
 
-FLOAT_COLUMNS = ("arc_length", "x", "y", "z", "qx", "qy", "qz", "qw")
+WAYPOINT_COLUMNS = ("arc_length", "x", "y", "z", "qx", "qy", "qz", "qw")
 """The columns of a row that hold the waypoint: metres, and a quaternion."""
+
+MOTION_ARRAYS = ("velocities", "accelerations", "position_sigma", "velocity_sigma", "acceleration_sigma")
+"""The arrays of a `Motion`, (W, 3) each, in the order in which `motion_rows` puts them side by side."""
+
+MOTION_COLUMNS = tuple(
+    prefix + axis for prefix in ("v", "a", "sigma_", "sigma_v", "sigma_a") for axis in ("x", "y", "z")
+)
+"""The columns of a row that hold the waypoint's motion: metres, m/s, m/s^2. Empty where it is not known."""
+
+FLOAT_COLUMNS = WAYPOINT_COLUMNS + MOTION_COLUMNS
+"""The columns of a row that hold numbers with a fraction."""
 
 COLUMNS = STATUS_COLUMNS + FLOAT_COLUMNS
 """The columns of the table formats, in order."""
+
+
+def motion_rows(estimate: Estimate) -> FloatArray:
+    """The motion of the waypoints, (W, 15), as `MOTION_COLUMNS` name it; NaN where it is not known."""
+    motion = estimate.motion
+    if motion is None:
+        return np.full((len(estimate.waypoints), len(MOTION_COLUMNS)), np.nan)
+    return np.hstack([getattr(motion, name) for name in MOTION_ARRAYS])
+
+
+def float_rows(estimate: Estimate) -> FloatArray:
+    """A row a waypoint, (W, 23), as `FLOAT_COLUMNS` name it; NaN for what is not known."""
+    waypoints = estimate.waypoints
+    return np.column_stack((waypoints.arc_length, waypoints.positions, waypoints.quaternions, motion_rows(estimate)))
 
 
 class ResultWriter(Protocol):

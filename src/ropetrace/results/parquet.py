@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ropetrace.errors import import_extra
-from ropetrace.results.base import FLOAT_COLUMNS, Closing
+from ropetrace.results.base import FLOAT_COLUMNS, Closing, float_rows
 from ropetrace.results.checkpoint import Checkpoint
 from ropetrace.types import Cloud, Estimate, Frame
 
@@ -18,7 +18,7 @@ arrow_parquet: Any = import_extra("pyarrow.parquet", "parquet")
 
 
 class ParquetWriter(Closing):
-    """One row a waypoint; a frame without waypoints is one row with nulls.
+    """One row a waypoint; a frame without waypoints is one row with nulls, and an unknown motion is nulls.
 
     The metadata are key-values of the schema, `frame_name` among them.
 
@@ -33,6 +33,7 @@ class ParquetWriter(Closing):
             [
                 ("frame", arrow.int64()),
                 ("stamp_ns", arrow.int64()),
+                ("ahead_ns", arrow.int64()),
                 ("waypoint", arrow.int32()),
                 ("status", arrow.string()),
                 *((name, arrow.float64()) for name in FLOAT_COLUMNS),
@@ -44,27 +45,20 @@ class ParquetWriter(Closing):
         self._checkpoint = Checkpoint(path, overwrite, self._save)
 
     def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
-        waypoints = estimate.waypoints
-        count = len(waypoints)
+        count = len(estimate.waypoints)
         rows = max(count, 1)
-        numbers: list[Any]
-        if count:
-            values = np.column_stack((waypoints.arc_length, waypoints.positions, waypoints.quaternions))
-            numbers = [np.arange(count, dtype=np.int32), *np.ascontiguousarray(values.T)]
-        else:
-            numbers = [
-                arrow.nulls(1, arrow.int32()),
-                *([arrow.nulls(1, arrow.float64())] * len(FLOAT_COLUMNS)),
-            ]
-        waypoint, *floats = numbers
+        numbers = np.arange(count, dtype=np.int32) if count else arrow.nulls(1, arrow.int32())
+        values = float_rows(estimate) if count else np.full((1, len(FLOAT_COLUMNS)), np.nan)
         self._batches.append(
             arrow.record_batch(
                 [
                     np.full(rows, index, np.int64),
                     np.full(rows, estimate.stamp_ns, np.int64),
-                    waypoint,
+                    np.full(rows, estimate.ahead_ns, np.int64),
+                    numbers,
                     arrow.array([str(estimate.status)] * rows),
-                    *floats,
+                    # `from_pandas` is what makes a NaN a null.
+                    *(arrow.array(column, from_pandas=True) for column in np.ascontiguousarray(values.T)),
                 ],
                 schema=self._schema,
             )

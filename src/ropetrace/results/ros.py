@@ -15,7 +15,12 @@ from ropetrace.results.base import Closing, WholeFile, uninterrupted
 from ropetrace.types import Cloud, Estimate, Frame, Status
 
 CENTERLINE_TOPIC = "/ropetrace/centerline"
+MOTION_TOPIC = "/ropetrace/motion"
 STATUS_TOPIC = "/ropetrace/status"
+
+PATH = "nav_msgs/msg/Path"
+TRAJECTORY = "trajectory_msgs/msg/MultiDOFJointTrajectory"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 NANOSECONDS = 1_000_000_000
 LAST_STAMP = (1 << 31) * NANOSECONDS - 1
@@ -23,16 +28,18 @@ LAST_STAMP = (1 << 31) * NANOSECONDS - 1
 
 
 class McapWriter(Closing):
-    """A `nav_msgs/msg/Path` and a `diagnostic_msgs/msg/DiagnosticArray` a frame.
+    """A `PATH`, a `TRAJECTORY` and a `DIAGNOSTICS` message a frame.
 
-    A lost frame is a path without poses, which clears the curve in a viewer. Each frame is a chunk of its
+    A lost frame is a path without poses, which clears the curve in a viewer, and a motion that is not known is a
+    trajectory without points. The messages are logged at the frame's stamp, among the images that they come from;
+    the stamp in the path's and the motion's header is the time for which they hold. Each frame is a chunk of its
     own, with a checksum, and reaches the system before `write` returns: a process that is killed loses no
     frame that was written. The metadata are the record ``ropetrace``, `frame_name` among them.
 
     Raises
     ------
     OutputError
-        If the file cannot be created or written, or a stamp does not fit a ROS time: before 1970, after 2038.
+        If the file cannot be created or written, or a time does not fit a ROS time: before 1970, after 2038.
     """
 
     def __init__(self, path: Path, *, overwrite: bool, frame_name: str, metadata: Mapping[str, str]) -> None:
@@ -48,20 +55,22 @@ class McapWriter(Closing):
         with self._file.closed_on_error():
             self._writer.start(profile="ros2", library="ropetrace")
             self._writer.add_metadata("ropetrace", {**metadata, "frame_name": frame_name})
-            self._centerline = self._channel(CENTERLINE_TOPIC, "nav_msgs/msg/Path")
-            self._status = self._channel(STATUS_TOPIC, "diagnostic_msgs/msg/DiagnosticArray")
+            self._centerline = self._channel(CENTERLINE_TOPIC, PATH)
+            self._motion = self._channel(MOTION_TOPIC, TRAJECTORY)
+            self._status = self._channel(STATUS_TOPIC, DIAGNOSTICS)
             self._writer.flush()
 
     def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
         stamp_ns = estimate.stamp_ns
-        if not 0 <= stamp_ns <= LAST_STAMP:
-            raise OutputError(f"{self._path}: frame {index}: the stamp {stamp_ns} ns does not fit a ROS time")
-        types = self._store.types
-        time = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
-        header = types["std_msgs/msg/Header"](time, self._frame_id)
+        held_ns = stamp_ns + estimate.ahead_ns
+        for name, time_ns in (("stamp", stamp_ns), ("predicted time", held_ns)):
+            if not 0 <= time_ns <= LAST_STAMP:
+                raise OutputError(f"{self._path}: frame {index}: the {name} {time_ns} ns does not fit a ROS time")
+        held = self._header(held_ns)
         messages = (
-            (self._centerline, self._path_message(header, estimate), "nav_msgs/msg/Path"),
-            (self._status, self._status_message(header, estimate), "diagnostic_msgs/msg/DiagnosticArray"),
+            (self._centerline, self._path_message(held, estimate), PATH),
+            (self._motion, self._motion_message(held, estimate), TRAJECTORY),
+            (self._status, self._status_message(self._header(stamp_ns), estimate), DIAGNOSTICS),
         )
         packed = [(channel, self._store.serialize_cdr(message, name)) for channel, message, name in messages]
         try:
@@ -92,14 +101,36 @@ class McapWriter(Closing):
         schema = self._writer.register_schema(name, "ros2msg", text.encode())
         return int(self._writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""}))
 
+    def _header(self, time_ns: int) -> Any:
+        types = self._store.types
+        time = types["builtin_interfaces/msg/Time"](*divmod(time_ns, NANOSECONDS))
+        return types["std_msgs/msg/Header"](time, self._frame_id)
+
     def _path_message(self, header: Any, estimate: Estimate) -> Any:
         types = self._store.types
         pose_stamped, pose = types["geometry_msgs/msg/PoseStamped"], types["geometry_msgs/msg/Pose"]
         point, quaternion = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Quaternion"]
         rows = np.hstack((estimate.waypoints.positions, estimate.waypoints.quaternions)).tolist()
-        return types["nav_msgs/msg/Path"](
-            header, [pose_stamped(header, pose(point(*row[:3]), quaternion(*row[3:]))) for row in rows]
+        return types[PATH](header, [pose_stamped(header, pose(point(*row[:3]), quaternion(*row[3:]))) for row in rows])
+
+    def _motion_message(self, header: Any, estimate: Estimate) -> Any:
+        types = self._store.types
+        motion, waypoints = estimate.motion, estimate.waypoints
+        if motion is None or not len(motion):
+            return types[TRAJECTORY](header, [], [])
+        vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+        transform, twist = types["geometry_msgs/msg/Transform"], types["geometry_msgs/msg/Twist"]
+        still = vector(0.0, 0.0, 0.0)
+        point = types["trajectory_msgs/msg/MultiDOFJointTrajectoryPoint"](
+            [
+                transform(vector(*position), quaternion(*turn))
+                for position, turn in zip(waypoints.positions.tolist(), waypoints.quaternions.tolist(), strict=True)
+            ],
+            [twist(vector(*velocity), still) for velocity in motion.velocities.tolist()],
+            [twist(vector(*acceleration), still) for acceleration in motion.accelerations.tolist()],
+            types["builtin_interfaces/msg/Duration"](0, 0),
         )
+        return types[TRAJECTORY](header, [f"waypoint_{number}" for number in range(len(waypoints))], [point])
 
     def _status_message(self, header: Any, estimate: Estimate) -> Any:
         types = self._store.types
@@ -112,8 +143,9 @@ class McapWriter(Closing):
             "point_count": str(estimate.point_count),
             "nodes": str(len(estimate.nodes)),
             "length": repr(estimate.waypoints.length),
+            "ahead": repr(estimate.ahead_ns / NANOSECONDS),
         }
-        return types["diagnostic_msgs/msg/DiagnosticArray"](
+        return types[DIAGNOSTICS](
             header, [status(level, "ropetrace", message, "", [pair(*item) for item in values.items()])]
         )
 
