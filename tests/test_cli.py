@@ -23,6 +23,7 @@ from helpers import DATA, needs_data
 from ropetrace import cli, demo
 from ropetrace.recordings.mcap_file import McapFrameWriter
 from ropetrace.recordings.rgbd_folder import RgbdFolderWriter
+from ropetrace.results.base import COLUMNS
 from ropetrace.sim.camera import Capsules, RayCaster, Scene
 from ropetrace.terminal import INTERRUPTED
 from ropetrace.types import Intrinsics, RgbdFrame
@@ -128,7 +129,7 @@ def test_track_writes_every_format_and_the_settings(run: Run, folder: Path, tmp_
     code, out, _ = run("track", folder, "--diameter", "24mm", "--color", COLOR, "--out", *outputs, "--picture", "r.png")
     assert code == 0, out
     table = rows(tmp_path / "r.csv")
-    assert ",".join(table[0]) == "frame,stamp_ns,waypoint,status,arc_length,x,y,z,qx,qy,qz,qw"
+    assert tuple(table[0]) == COLUMNS
     assert {row["frame"] for row in table} == {str(k) for k in range(FRAMES)}
     with np.load(tmp_path / "r.npz", allow_pickle=False) as arrays:
         assert len(arrays["positions"]) == len(table)

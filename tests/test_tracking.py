@@ -14,7 +14,7 @@ from ropetrace.config import RopeConfig
 from ropetrace.errors import OutputError
 from ropetrace.trackers import SlicingTracker
 from ropetrace.tracking import Summary, in_world, track_recording
-from ropetrace.types import BadFrame, Cloud, Estimate, Event, Frame, RgbdFrame, Status
+from ropetrace.types import BadFrame, Cloud, Estimate, Event, Frame, Motion, RgbdFrame, Status, Waypoints
 
 HANGING = SHAPES["hanging"]
 CONFIG = RopeConfig(diameter=0.012, color=RED_TEXT)
@@ -173,6 +173,28 @@ def test_everything_is_handed_on_in_the_worlds_frame() -> None:
     )
     assert (world.status, world.stamp_ns, world.point_count) == (camera.status, camera.stamp_ns, camera.point_count)
     assert len(placed.rows[1][1].nodes) == 0
+
+
+def test_the_motion_turns_with_the_rope() -> None:
+    quarter = np.array([[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]])
+    vectors, sigmas = np.array([[1.0, 2.0, 3.0], [-4.0, 5.0, 6.0]]), np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    waypoints = Waypoints(vectors, np.tile([0.0, 0, 0, 1], (2, 1)), np.array([0.0, 1.0]))
+    motion = Motion(vectors, 10 * vectors, sigmas, 2 * sigmas, 3 * sigmas)
+    world = in_world(Estimate(3, Status.OK, waypoints=waypoints, motion=motion, ahead_ns=25), quarter)
+    turned, swapped = np.array([[-2.0, 1, 3], [-5, -4, 6]]), np.array([[0.2, 0.1, 0.3], [0.5, 0.4, 0.6]])
+    assert world.motion is not None
+    np.testing.assert_array_equal(world.waypoints.positions, turned + [5, 6, 7])
+    np.testing.assert_array_equal(world.motion.velocities, turned)
+    np.testing.assert_array_equal(world.motion.accelerations, 10 * turned)
+    np.testing.assert_allclose(world.motion.position_sigma, swapped, rtol=1e-15)
+    np.testing.assert_allclose(world.motion.velocity_sigma, 2 * swapped, rtol=1e-15)
+    np.testing.assert_allclose(world.motion.acceleration_sigma, 3 * swapped, rtol=1e-15)
+    assert world.ahead_ns == 25
+
+
+def test_a_motion_that_is_not_known_stays_so_in_the_world() -> None:
+    waypoints = Waypoints(np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1)), np.array([0.0, 1.0]))
+    assert in_world(Estimate(3, Status.OK, waypoints=waypoints), np.eye(4)).motion is None
 
 
 def test_a_lost_estimate_stays_lost_in_the_world() -> None:

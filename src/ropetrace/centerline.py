@@ -137,6 +137,29 @@ def make_waypoints(chain: FloatArray, spacing: float, previous: Waypoints | None
     return Waypoints(positions, quaternions, arc_length)
 
 
+def waypoints_through(positions: FloatArray, previous: Waypoints | None = None) -> Waypoints:
+    """Waypoints with poses at given places, such as predicted ones: nothing is sampled anew.
+
+    Parameters
+    ----------
+    positions : (W, 3) float array
+        W >= 2, in order along the rope, metres, camera frame. Places that coincide are allowed.
+    previous : Waypoints, optional
+        As in `make_waypoints`.
+    """
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    arc_length = np.concatenate([[0.0], np.cumsum(steps)])
+    distinct = np.concatenate([[True], steps > SHORTEST_STEP])
+    if np.count_nonzero(distinct) < 2:
+        tangents = np.tile([0.0, 1.0, 0.0], (len(positions), 1))
+    else:
+        tangents = chain_tangents(np.ascontiguousarray(positions[distinct]))[np.cumsum(distinct) - 1]
+    reference = previous.quaternions[0] if previous is not None and len(previous) else _IDENTITY
+    quaternions = np.empty((len(tangents), 4))
+    _quaternions(waypoint_frames(tangents), reference, quaternions)
+    return Waypoints(positions, quaternions, arc_length)
+
+
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 

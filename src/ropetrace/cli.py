@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, arg
 
-from ropetrace.cli_simulation import Reproduce, Simulate
+from ropetrace.cli_simulation import Reproduce, Simulate, parse_duration
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
 from ropetrace.terminal import INTERRUPTED, progress_bar
 
@@ -152,6 +152,9 @@ class Track:
     """An image of the frames' size, white where the rope may be; replaces the colour."""
     frame: Literal["camera", "world"] = "camera"
     """The frame of the results; world needs camera_pose in the config."""
+    predict: Annotated[str | None, arg(metavar="now|DURATION")] = None
+    """Write the centreline of a later time than the frame's stamp: a duration such as 40ms, or now, the moment at which
+    the frame has been worked on, as if it came at its stamp."""
     view: bool = False
     """Show it live in the Rerun viewer."""
     overwrite: bool = False
@@ -159,11 +162,13 @@ class Track:
 
     def run(self) -> int:
         config = self.rope.settings()
+        predict = _prediction(self.predict, config)
         recording = self.source.open()
         return _track(
             recording,
             config,
             list(self.out),
+            predict=predict,
             picture=self.picture,
             start=self.source.start,
             limit=self.source.limit,
@@ -296,6 +301,7 @@ def _track(
     config: RopeConfig,
     outputs: list[Path],
     *,
+    predict: float | Literal["now"] = 0.0,
     picture: Path | None = None,
     start: int = 0,
     limit: int | None = None,
@@ -306,6 +312,7 @@ def _track(
     extra_sinks: list[Any] | None = None,
     inputs: list[Path] | None = None,
 ) -> int:
+    from ropetrace.motion import make_motion
     from ropetrace.picture import ContactSheet
     from ropetrace.results import check_outputs, open_writer
     from ropetrace.trackers import make_tracker
@@ -354,6 +361,8 @@ def _track(
                 recording.frames(start, limit),
                 tracker,
                 sinks,
+                motion=make_motion(config.motion.method, config.diameter),
+                predict=predict,
                 first_index=start,
                 world_from_camera=pose,
                 wants_cloud=view or any(path.suffix.lower() == ".rrd" for path in outputs),
@@ -397,6 +406,27 @@ def _progress(total: int | None) -> Iterator[Any]:
             bar.update()
 
         yield advance
+
+
+LONGEST_PREDICTION = 1.0
+"""Seconds: further ahead no extrapolation of a rope's motion means anything."""
+
+
+def _prediction(text: str | None, config: RopeConfig) -> float | Literal["now"]:
+    """What --predict asks for, checked."""
+    if text is None:
+        return 0.0
+    if config.motion.method == "none":
+        raise ConfigError('--predict needs the motion of the rope: take motion.method = "none" out of the config')
+    if text == "now":
+        return "now"
+    try:
+        seconds = parse_duration(text)
+    except ConfigError as error:
+        raise ConfigError(f"--predict: {error}, or now") from None
+    if not 0 <= seconds <= LONGEST_PREDICTION:
+        raise ConfigError(f"--predict {text}: expected 0 to {LONGEST_PREDICTION:g} s")
+    return seconds
 
 
 def _has_color(recording: Recording, start: int) -> bool:

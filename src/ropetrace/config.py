@@ -232,6 +232,14 @@ class CenterlineConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class MotionConfig:
+    """How velocities and accelerations are estimated (section 5.1)."""
+
+    method: Literal["arc_length", "closest", "none"] = "arc_length"
+    """`arc_length`: points at equal arc length, each with a bank of filters. `closest`: the paper's Algorithm 1."""
+
+
+@dataclass(frozen=True, slots=True)
 class RopeConfig:
     """Everything that ropetrace must be told of a rope; the diameter and the colour are enough.
 
@@ -253,6 +261,7 @@ class RopeConfig:
     slicing: SlicingConfig = field(default_factory=SlicingConfig)
     ordering: OrderingConfig = field(default_factory=OrderingConfig)
     centerline: CenterlineConfig = field(default_factory=CenterlineConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
 
     def __post_init__(self) -> None:
         low, high = DIAMETER_RANGE

@@ -6,11 +6,13 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
+from ropetrace.centerline import waypoints_through
 from ropetrace.errors import FrameError
+from ropetrace.motion import MotionEstimator
 from ropetrace.results.base import uninterrupted
 from ropetrace.trackers.base import Tracker
 from ropetrace.types import BadFrame, Cloud, Estimate, Event, FloatArray, Frame, Status, moved
@@ -89,6 +91,8 @@ def track_recording(
     tracker: Tracker,
     sinks: Iterable[Sink] = (),
     *,
+    motion: MotionEstimator | None = None,
+    predict: float | Literal["now"] = 0.0,
     first_index: int = 0,
     world_from_camera: FloatArray | None = None,
     wants_cloud: bool = False,
@@ -105,6 +109,11 @@ def track_recording(
         Takes them.
     sinks : iterable of Sink
         Each is given every estimate.
+    motion : MotionEstimator, optional
+        Gives the waypoints their velocities and accelerations.
+    predict : float or "now"
+        Hand on the centreline of this many seconds after the frame's stamp, or, as if the frame came at its stamp, of
+        the moment at which it is handed on: then the results depend on how fast this machine was.
     first_index : int
         Index of the first frame in its recording.
     world_from_camera : (4, 4) float array, optional
@@ -139,7 +148,14 @@ def track_recording(
             if event is None:
                 break
             watch.lap("read")
+            came = time.perf_counter()
             estimate = _estimate(event, tracker, watch)
+            if motion is not None:
+                estimate = with_motion(estimate, motion)
+                if predict:
+                    ahead = time.perf_counter() - came if predict == "now" else predict
+                    estimate = ahead_of_time(estimate, motion, ahead)
+                watch.lap("motion")
             if world_from_camera is not None:
                 estimate = in_world(estimate, world_from_camera)
             cloud = tracker.cloud() if wants_cloud and not isinstance(event, BadFrame) else None
@@ -161,12 +177,35 @@ def track_recording(
     return summary
 
 
+def with_motion(estimate: Estimate, motion: MotionEstimator) -> Estimate:
+    """The estimate with the motion of its waypoints, which the estimator is told of."""
+    if not len(estimate.waypoints):
+        return estimate
+    return replace(estimate, motion=motion.update(estimate.stamp_ns, estimate.waypoints))
+
+
+def ahead_of_time(estimate: Estimate, motion: MotionEstimator, ahead: float) -> Estimate:
+    """The estimate that `motion` took last, `ahead` seconds later; as it is where its motion is not known."""
+    prediction = None if estimate.motion is None else motion.predict(ahead)
+    if prediction is None:
+        return estimate
+    positions, moving = prediction
+    return replace(
+        estimate,
+        waypoints=waypoints_through(positions, estimate.waypoints),
+        motion=moving,
+        ahead_ns=round(ahead * 1e9),
+    )
+
+
 def in_world(estimate: Estimate, world_from_camera: FloatArray) -> Estimate:
-    """The estimate with its positions and orientations in the world's frame."""
+    """The estimate with its positions, orientations and motion in the world's frame."""
+    motion = estimate.motion
     return replace(
         estimate,
         nodes=moved(estimate.nodes, world_from_camera),
         waypoints=estimate.waypoints.transformed(world_from_camera),
+        motion=None if motion is None else motion.rotated(world_from_camera),
     )
 
 
