@@ -99,6 +99,8 @@ class Reproduce:
     """Of the depth camera: none (as in the paper), kinect_v1, stereo, kinect_v1_edges, stereo_edges."""
     latency: Annotated[str | None, arg(metavar="DURATION")] = None
     """From a frame's arrival to its centreline, such as 40ms of simulated time; by default measured on this machine."""
+    predict: Literal["none", "now"] = "none"
+    """now: each reading asks for the centreline of its own moment, predicted from what is available then."""
     phase: float | None = None
     """When frames come, in frame intervals after a reading, 0 to 1; 0 is the worst. By default every phase comes
     equally often, as from a camera that nobody synchronises."""
@@ -120,6 +122,7 @@ class Reproduce:
         settings = Case1Settings(
             duration=QUICK_SECONDS if self.quick else Case1Settings().duration,
             noise=self.noise,
+            predict=self.predict,
             phase=self.phase,
             latency=None if self.latency is None else parse_duration(self.latency),
         )

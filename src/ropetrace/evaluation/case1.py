@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,11 @@ from ropetrace.config import RopeConfig, format_color
 from ropetrace.errors import ConfigError
 from ropetrace.evaluation.metrics import coverage, symmetric_mean
 from ropetrace.evaluation.paper_errors import angular_errors, linear_errors
+from ropetrace.motion import MotionEstimator, make_motion
 from ropetrace.sim.rope import TIMESTEP, Wind
 from ropetrace.sim.scenario import ROPE_COLOR, CameraSettings, Scenario, SimulatedScene, Truth
 from ropetrace.trackers import make_tracker
+from ropetrace.tracking import ahead_of_time, with_motion
 from ropetrace.types import Estimate, FloatArray
 
 FREQUENCIES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6)
@@ -76,6 +78,9 @@ class Case1Settings:
     noise: str = "none"
     """Of the depth camera: Gazebo's had none."""
     method: str = "slicing"
+    predict: Literal["none", "now"] = "none"
+    """`now`: whoever reads asks for the centreline of that moment, predicted from what is available then; `none`: takes
+    the newest as it is, as the paper does."""
     phase: float | None = None
     """When frames are taken, in frame intervals after a reading; 0 is the worst, since a frame of the very moment of a
     reading comes too late for it. None is a camera that nobody synchronises: its clock is slow by one frame interval in
@@ -175,12 +180,16 @@ def measure_compute_time(condition: Condition, settings: Case1Settings, frames: 
     if settings.latency is not None:
         return settings.latency
     simulated = SimulatedScene(scenario(condition, RESONANCE, settings))
-    tracker = make_tracker(rope_config(settings))
+    config = rope_config(settings)
+    tracker, motion = make_tracker(config), make_motion(config.motion.method, config.diameter)
+    assert motion is not None
     seconds = []
     for index in range(frames + 5):
         frame = simulated.camera.expose(simulated.scene_at, simulated.camera.stamp(index), index)
         start = time.perf_counter()
-        tracker.update(frame)
+        estimate = tracker.update(frame)
+        if settings.predict == "now":
+            with_motion(estimate, motion)
         seconds.append(time.perf_counter() - start)
     return float(np.percentile(seconds[5:], 99)) * condition.speed
 
@@ -237,7 +246,9 @@ def run_case(condition: Condition, frequency: float, settings: Case1Settings, co
 
 
 def _readings(simulated: SimulatedScene, settings: Case1Settings, compute_time: float) -> Iterator[dict[str, Any]]:
-    tracker = make_tracker(rope_config(settings))
+    config = rope_config(settings)
+    tracker = make_tracker(config)
+    motion = make_motion(config.motion.method, config.diameter) if settings.predict == "now" else None
     camera = simulated.camera
     moments = settings.warm_up + settings.interval * np.arange(1, settings.readings + 1)
     stamps = frame_stamps(camera.rate, simulated.scenario.frame_count, settings)
@@ -255,10 +266,17 @@ def _readings(simulated: SimulatedScene, settings: Case1Settings, compute_time: 
         simulated.rope.advance(moment)
         while waiting and waiting[0][0] <= moment + 1e-9:
             newest = waiting.pop(0)
-        yield _reading(moment, newest, simulated.truth())
+            if motion is not None:
+                newest = (*newest[:2], with_motion(newest[2], motion), newest[3])
+        yield _reading(moment, newest, simulated.truth(), motion)
 
 
-def _reading(moment: float, newest: tuple[float, float, Estimate, Truth] | None, truth: Truth) -> dict[str, Any]:
+def _reading(
+    moment: float,
+    newest: tuple[float, float, Estimate, Truth] | None,
+    truth: Truth,
+    motion: MotionEstimator | None = None,
+) -> dict[str, Any]:
     missing = float("nan")
     ideal = make_waypoints(truth.polyline, 0.0075)
     row: dict[str, Any] = {
@@ -285,6 +303,14 @@ def _reading(moment: float, newest: tuple[float, float, Estimate, Truth] | None,
     line = estimate.waypoints
     if len(line) < 2:
         return row
+    row |= {
+        "linear_at_stamp": float(linear_errors(line.positions, then.polyline).mean()),
+        "angular_at_stamp": float(
+            angular_errors(line.positions, line.quaternions, then.polyline, then.link_quaternions).mean()
+        ),
+    }
+    if motion is not None:
+        line = ahead_of_time(estimate, motion, moment - stamp).waypoints
     return row | {
         "linear": float(linear_errors(line.positions, truth.polyline).mean()),
         "angular": float(
@@ -292,9 +318,5 @@ def _reading(moment: float, newest: tuple[float, float, Estimate, Truth] | None,
         ),
         "symmetric": symmetric_mean(line.positions, truth.polyline),
         "coverage": coverage(line.positions, truth.polyline, _COVERED),
-        "linear_at_stamp": float(linear_errors(line.positions, then.polyline).mean()),
-        "angular_at_stamp": float(
-            angular_errors(line.positions, line.quaternions, then.polyline, then.link_quaternions).mean()
-        ),
         "moved": symmetric_mean(then.polyline, truth.polyline),
     }

@@ -149,6 +149,11 @@ def _phase(settings: Case1Settings) -> str:
     return f"{settings.phase:g} frame intervals after a reading"
 
 
+def _read(settings: Case1Settings) -> str:
+    newest = "the newest centreline available at that moment"
+    return newest if settings.predict == "none" else f"{newest}, predicted to that moment from its motion,"
+
+
 def report_text(results: Results, settings: Case1Settings, compute_times: Mapping[str, float]) -> str:
     """The whole report, in Markdown."""
     parts = [
@@ -156,7 +161,7 @@ def report_text(results: Results, settings: Case1Settings, compute_times: Mappin
         f"{settings.duration:g} s of simulated time a case after {settings.warm_up:g} s of warming up, a reading every "
         f"{settings.interval:g} s, none removed; sensor noise: {settings.noise}; frames come {_phase(settings)}; "
         f"tracker: {settings.method}; seed {settings.seed}.",
-        "Each reading compares the newest centreline available at that moment with the rope as it is then. From a "
+        f"Each reading compares {_read(settings)} with the rope as it is then. From a "
         "frame's arrival to its centreline, in simulated time ("
         + ("set by hand" if settings.latency is not None else "p99, measured once before the run")
         + "): "
