@@ -29,7 +29,7 @@ ROPE, SECOND_ROPE, CLUTTER = 0, 1, 2
 
 ROPE_COLOR = (200, 40, 30)
 _CLUTTER_COLOR = (150, 150, 140)
-_ROBOT_COLOR = (225, 225, 220)
+ROBOT_COLOR = (225, 225, 220)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +203,11 @@ class SimulatedScene:
     scenario : Scenario
         What is simulated.
 
+    Attributes
+    ----------
+    robot : Capsules
+        The robot's links, world frame. Those of the scenario stand still; whoever moves an arm sets its own.
+
     Raises
     ------
     ConfigError
@@ -236,10 +241,10 @@ class SimulatedScene:
         self._boxes = Boxes.none()
         for x, y, z, width, depth, height in clutter.boxes:
             self._boxes += Boxes.one((x, y, z), (width, depth, height), _CLUTTER_COLOR, CLUTTER)
-        self._robot = Capsules.none()
+        self.robot = Capsules.none()
         for link in clutter.robot:
             ends = np.array(link[:6]).reshape(2, 1, 3)
-            self._robot += Capsules.between(ends[0], ends[1], link[6], _ROBOT_COLOR, CLUTTER)
+            self.robot += Capsules.between(ends[0], ends[1], link[6], ROBOT_COLOR, CLUTTER)
         check_camera_outside(self.scene(), self.world_from_camera)
 
     def scene(self) -> Scene:
@@ -251,7 +256,7 @@ class SimulatedScene:
             capsules += Capsules.between(
                 starts + aside, ends + aside, self.scenario.rope.radius, ROPE_COLOR, SECOND_ROPE
             )
-        return Scene(capsules + self._robot, self._planes, self._boxes)
+        return Scene(capsules + self.robot, self._planes, self._boxes)
 
     def truth(self) -> Truth:
         """What is true now."""

@@ -50,14 +50,19 @@ class Capsules:
 
     @classmethod
     def between(
-        cls, starts: FloatArray, ends: FloatArray, radius: float, color: Color = (200, 40, 30), label: int = 0
+        cls,
+        starts: FloatArray,
+        ends: FloatArray,
+        radius: float | FloatArray,
+        color: Color = (200, 40, 30),
+        label: int = 0,
     ) -> Capsules:
-        """Capsules of one radius, colour and label, from (C, 3) starts to (C, 3) ends."""
+        """Capsules of one colour and label, and one radius or (C,) radii, from (C, 3) starts to (C, 3) ends."""
         count = len(starts)
         return cls(
             np.ascontiguousarray(starts, dtype=float),
             np.ascontiguousarray(ends, dtype=float),
-            np.full(count, float(radius)),
+            np.broadcast_to(np.asarray(radius, float), (count,)).copy(),
             np.tile(np.array(color, np.uint8), (count, 1)),
             np.full(count, label, np.int16),
         )

@@ -1,0 +1,1 @@
+"""Guiding a robot arm along the rope (section 5.2)."""
