@@ -13,11 +13,13 @@ import numpy as np
 import pyarrow
 import pytest
 from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
 
 from result_examples import FIRST_STAMP, REASONS, cloud, estimate, frame, helix, motion
 from ropetrace.errors import OutputError
 from ropetrace.results import live, open_writer
 from ropetrace.results.live import LiveViewer
+from ropetrace.results.rrd import RrdWriter
 from ropetrace.types import Cloud, CloudFrame, Estimate, Frame, Status, Waypoints
 from ropetrace.viewer import (
     AXES,
@@ -27,6 +29,7 @@ from ropetrace.viewer import (
     NODE_COLORS,
     VELOCITY_COLOR,
     VELOCITY_SECONDS,
+    ArmView,
 )
 
 Rows = dict[str, dict[int | None, dict[str, Any]]]
@@ -37,6 +40,10 @@ def logged(path: Path, *steps: tuple[Estimate, Frame | None, Cloud | None], **op
     with open_writer(path, **options) as writer:
         for index, (item, seen, points) in enumerate(steps):
             writer.write(index, item, seen, points)
+    return read_back(path)
+
+
+def read_back(path: Path) -> Rows:
     rows: Rows = {}
     for chunk in RrdReader(path).stream():
         batch = chunk.to_record_batch()
@@ -129,6 +136,21 @@ def test_the_speed_is_that_of_the_fastest_waypoint(path: Path) -> None:
     item = dataclasses.replace(estimate(1), motion=dataclasses.replace(motion(1), velocities=velocities))
     rows = logged(path, (item, None, None))
     assert rows["/plots/speed"][0]["Scalars:scalars"] == [5.0]
+
+
+def test_an_arm_stands_where_it_is(path: Path) -> None:
+    starts = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [0.0, 0.0, 1.0], [2.0, 2.0, 2.0]])
+    ends = starts + np.array([[0.3, -0.1, 0.2], [0.0, 0.0, -0.5], [0.0, 0.0, 0.4], [0.0, 0.0, 0.0]])
+    arm = ArmView(starts, ends, np.array([0.01, 0.02, 0.03, 0.04]), np.eye(4), 0.002)
+    with RrdWriter(path, overwrite=False, frame_name="world", metadata={}, arm=True) as writer:
+        writer.write(0, estimate(0), None, None, arm)
+    rows = read_back(path)
+    links = rows["/arm/links"][0]
+    turns = Rotation.from_quat(np.array(links["Capsules3D:quaternions"]))
+    reach = turns.apply([0, 0, 1]) * np.array(links["Capsules3D:lengths"])[:, None]
+    np.testing.assert_allclose(np.array(links["Capsules3D:translations"]) + reach, ends, atol=1e-6)
+    np.testing.assert_allclose(links["Capsules3D:radii"], arm.radii, rtol=1e-6)
+    assert rows["/plots/tool_distance"][0]["Scalars:scalars"] == [0.002]
 
 
 def test_a_motion_that_is_not_known_is_not_drawn(path: Path) -> None:

@@ -17,6 +17,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, arg
 
 from ropetrace.cli_simulation import Reproduce, Simulate, parse_duration
+from ropetrace.cli_trace import Trace
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
 from ropetrace.terminal import INTERRUPTED, progress_bar
 
@@ -261,6 +262,7 @@ def main() -> None:
         | Annotated[Info, tyro.conf.subcommand("info")]
         | Annotated[Doctor, tyro.conf.subcommand("doctor")]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+        | Annotated[Trace, tyro.conf.subcommand("trace")]
         | Annotated[Reproduce, tyro.conf.subcommand("reproduce")],  # type: ignore[arg-type]
         prog="ropetrace",
         description="The 3-D shape of a rope, cable or hose from the recordings of an RGB-D camera. "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -49,9 +50,38 @@ NODE_COLORS = np.array(
 )
 """Given in turn along the chain, so that the cuts between slices show."""
 
+ARM_COLOR = (200, 205, 210)
+TOOL_AXES = 0.08
+"""Length of the arrows that show the tool's frame, metres."""
+
+AXIS_COLORS = np.array([(255, 60, 60), (60, 200, 60), (70, 110, 255)], np.uint8)
+
 NO_NODE_COLOR = (110, 110, 110)
 
 NO_METADATA: Mapping[str, str] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmView:
+    """An arm at a moment, in the frame of the estimates.
+
+    Parameters
+    ----------
+    starts, ends : (K, 3) float array
+        Ends of the axes of the capsules that its links look like, metres.
+    radii : (K,) float array
+        Metres.
+    tool : (4, 4) float array
+        The tool's pose.
+    distance : float
+        From the tool to the rope, metres: plotted.
+    """
+
+    starts: FloatArray
+    ends: FloatArray
+    radii: FloatArray
+    tool: FloatArray
+    distance: float
 
 
 def new_recording() -> Any:
@@ -61,8 +91,12 @@ def new_recording() -> Any:
     return recording
 
 
-def default_blueprint() -> Any:
-    """How the viewer shows a run: the rope in 3-D, the image with the centreline in it, plots, the status."""
+def default_blueprint(arm: bool = False) -> Any:
+    """How the viewer shows a run: the rope in 3-D, the image with the centreline in it, plots, the status.
+
+    With an arm, the distance of its tool from the rope takes the place of the count of points.
+    """
+    last = ("Tool to rope (m)", "/plots/tool_distance") if arm else ("Points", "/plots/point_count")
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Spatial3DView(name="Rope", origin="/", contents=["+ /**", "- /camera/**"], line_grid=False),
@@ -81,7 +115,7 @@ def default_blueprint() -> Any:
                 rrb.Horizontal(
                     rrb.TimeSeriesView(name="Length (m)", origin="/plots/length"),
                     rrb.TimeSeriesView(name="Speed (m/s)", origin="/plots/speed"),
-                    rrb.TimeSeriesView(name="Points", origin="/plots/point_count"),
+                    rrb.TimeSeriesView(name=last[0], origin=last[1]),
                 ),
                 rrb.TextLogView(name="Status", origin="/status"),
                 row_shares=[3, 1.5, 1],
@@ -134,7 +168,14 @@ class RerunLog:
         for name, text in {**metadata, "frame_name": frame_name}.items():
             recording.log(f"metadata/{name}", rr.TextDocument(text), static=True)
 
-    def log(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
+    def log(
+        self,
+        index: int,
+        estimate: Estimate,
+        frame: Frame | None = None,
+        cloud: Cloud | None = None,
+        arm: ArmView | None = None,
+    ) -> None:
         """Log one frame; what it lacks is cleared, so that no picture outlives its frame.
 
         Parameters
@@ -147,6 +188,8 @@ class RerunLog:
             What the tracker saw.
         cloud : Cloud, optional
             The points that it took for the rope.
+        arm : ArmView, optional
+            An arm that works on the rope; the last one stays in the picture.
         """
         self._recording.set_time("frame", sequence=index)
         self._recording.set_time("time", timestamp=np.datetime64(estimate.stamp_ns, "ns"))
@@ -154,6 +197,8 @@ class RerunLog:
         self._log_scene(frame)
         self._log_rope(estimate, cloud)
         self._log_status(estimate)
+        if arm is not None:
+            self._log_arm(arm)
 
     def _log_images(self, frame: Frame | None) -> None:
         if not isinstance(frame, RgbdFrame):
@@ -226,6 +271,35 @@ class RerunLog:
             if estimate.motion is not None:
                 self._recording.log("rope/velocity", _velocity(estimate.waypoints, estimate.motion))
 
+    def _log_arm(self, arm: ArmView) -> None:
+        along = arm.ends - arm.starts
+        lengths = np.linalg.norm(along, axis=1)
+        # Rerun's capsules stand on z; the shortest turn from there has half the angle in this unnormalised quaternion.
+        x, y, z = (along / np.maximum(lengths, 1e-9)[:, None]).T
+        turns = np.stack([-y, x, np.zeros(len(x)), 1 + z], axis=1)
+        turns[1 + z < 1e-6] = (1.0, 0.0, 0.0, 0.0)
+        self._recording.log(
+            "arm/links",
+            rr.Capsules3D(
+                lengths=lengths,
+                radii=arm.radii,
+                translations=arm.starts,
+                quaternions=turns / np.linalg.norm(turns, axis=1, keepdims=True),
+                colors=ARM_COLOR,
+                fill_mode="solid",
+            ),
+        )
+        self._recording.log(
+            "arm/tool",
+            rr.Arrows3D(
+                origins=np.tile(arm.tool[:3, 3], (3, 1)),
+                vectors=TOOL_AXES * arm.tool[:3, :3].T,
+                colors=AXIS_COLORS,
+                radii=rr.Radius.ui_points(2.0),
+            ),
+        )
+        self._recording.log("plots/tool_distance", rr.Scalars(arm.distance))
+
     def _log_status(self, estimate: Estimate) -> None:
         self._recording.log("plots/length", rr.Scalars(estimate.waypoints.length))
         self._recording.log("plots/point_count", rr.Scalars(estimate.point_count))
@@ -255,7 +329,7 @@ def _axes(waypoints: Waypoints) -> Any:
     return rr.Arrows3D(
         origins=np.repeat(positions, 3, axis=0),
         vectors=axes.reshape(-1, 3),
-        colors=np.tile(np.array([(255, 60, 60), (60, 200, 60), (70, 110, 255)], np.uint8), (len(positions), 1)),
+        colors=np.tile(AXIS_COLORS, (len(positions), 1)),
         radii=rr.Radius.ui_points(1.5),
     )
 

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from ropetrace.errors import OutputError
 from ropetrace.results.base import Closing
 from ropetrace.types import Cloud, Estimate, FloatArray, Frame
-from ropetrace.viewer import NO_METADATA, RerunLog, default_blueprint, new_recording
+from ropetrace.viewer import NO_METADATA, ArmView, RerunLog, default_blueprint, new_recording
 
 START_SECONDS = 20.0
 """How long the app may take until it listens."""
@@ -49,6 +49,8 @@ class LiveViewer(Closing):
         As for `ropetrace.viewer.RerunLog`.
     arguments : sequence of str
         More arguments for the app, such as ``--headless``.
+    arm : bool
+        Whether an arm will be shown.
 
     Attributes
     ----------
@@ -70,14 +72,16 @@ class LiveViewer(Closing):
         frame_from_camera: FloatArray | None = None,
         metadata: Mapping[str, str] = NO_METADATA,
         arguments: Sequence[str] = (),
+        arm: bool = False,
     ) -> None:
         self.skipped = 0
-        self._slot: tuple[int, Estimate, Frame | None, Cloud | None] | None = None
+        self._slot: tuple[int, Estimate, Frame | None, Cloud | None, ArmView | None] | None = None
         self._changed = threading.Condition()
         self._stopping = False
         self._app, self.port = _start_app(arguments)
         self._recording = new_recording()
-        self._recording.connect_grpc(f"rerun+http://127.0.0.1:{self.port}/proxy", default_blueprint=default_blueprint())
+        address = f"rerun+http://127.0.0.1:{self.port}/proxy"
+        self._recording.connect_grpc(address, default_blueprint=default_blueprint(arm))
         self._log = RerunLog(
             self._recording, frame_name=frame_name, frame_from_camera=frame_from_camera, metadata=metadata
         )
@@ -89,11 +93,18 @@ class LiveViewer(Closing):
         """Whether the window is open and being fed."""
         return self._thread.is_alive() and self._app.poll() is None
 
-    def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
+    def write(
+        self,
+        index: int,
+        estimate: Estimate,
+        frame: Frame | None = None,
+        cloud: Cloud | None = None,
+        arm: ArmView | None = None,
+    ) -> None:
         with self._changed:
             if self._slot is not None or not self._thread.is_alive():
                 self.skipped += 1
-            self._slot = (index, estimate, frame, cloud)
+            self._slot = (index, estimate, frame, cloud, arm)
             self._changed.notify()
 
     def close(self, *, keep_window: bool = True) -> None:

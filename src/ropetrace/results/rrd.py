@@ -11,7 +11,7 @@ from pathlib import Path
 from ropetrace.errors import OutputError
 from ropetrace.results.base import Closing, WholeFile
 from ropetrace.types import Cloud, Estimate, FloatArray, Frame
-from ropetrace.viewer import RerunLog, default_blueprint, new_recording
+from ropetrace.viewer import ArmView, RerunLog, default_blueprint, new_recording
 
 PIECE_BYTES = 1 << 16
 """What is written at once: as much as a pipe holds."""
@@ -37,6 +37,7 @@ class RrdWriter(Closing):
         frame_name: str,
         metadata: Mapping[str, str],
         frame_from_camera: FloatArray | None = None,
+        arm: bool = False,
     ) -> None:
         self._error: OutputError | None = None
         self._closed = False
@@ -50,17 +51,24 @@ class RrdWriter(Closing):
             self._thread.start()
             try:
                 self._recording = new_recording()
-                self._recording.save(f"/dev/fd/{sink}", default_blueprint())
+                self._recording.save(f"/dev/fd/{sink}", default_blueprint(arm))
             finally:
                 os.close(sink)
             self._log = RerunLog(
                 self._recording, frame_name=frame_name, frame_from_camera=frame_from_camera, metadata=metadata
             )
 
-    def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
+    def write(
+        self,
+        index: int,
+        estimate: Estimate,
+        frame: Frame | None = None,
+        cloud: Cloud | None = None,
+        arm: ArmView | None = None,
+    ) -> None:
         if self._error is not None:
             raise self._error
-        self._log.log(index, estimate, frame, cloud)
+        self._log.log(index, estimate, frame, cloud, arm)
         if time.monotonic() - self._flushed >= FLUSH_SECONDS:
             # This waits for the disk, too: else Rerun's queue would take all memory where the disk is slow.
             self._recording.flush()
