@@ -8,20 +8,23 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
     from ropetrace.errors import RopetraceError
+    from ropetrace.motion import make_motion
     from ropetrace.recordings import open_recording
     from ropetrace.trackers import make_tracker
-    from ropetrace.types import BadFrame, CloudFrame, Estimate, Intrinsics, RgbdFrame, Status, Waypoints
+    from ropetrace.types import BadFrame, CloudFrame, Estimate, Intrinsics, Motion, RgbdFrame, Status, Waypoints
 
 _HOMES = {
     "BadFrame": "types",
     "CloudFrame": "types",
     "Estimate": "types",
     "Intrinsics": "types",
+    "Motion": "types",
     "RgbdFrame": "types",
     "RopeConfig": "config",
     "RopetraceError": "errors",
     "Status": "types",
     "Waypoints": "types",
+    "make_motion": "motion",
     "make_tracker": "trackers",
     "open_recording": "recordings",
 }
@@ -31,11 +34,13 @@ __all__ = [
     "CloudFrame",
     "Estimate",
     "Intrinsics",
+    "Motion",
     "RgbdFrame",
     "RopeConfig",
     "RopetraceError",
     "Status",
     "Waypoints",
+    "make_motion",
     "make_tracker",
     "open_recording",
 ]
