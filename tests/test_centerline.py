@@ -16,6 +16,7 @@ from ropetrace.centerline import (
     make_waypoints,
     sample_spline,
     waypoint_frames,
+    waypoints_through,
 )
 from ropetrace.types import FloatArray, Waypoints
 
@@ -236,3 +237,43 @@ def test_signs_follow_the_frame_before() -> None:
             assert (waypoints.quaternions[0] * previous.quaternions[0]).sum() > 0.99
         previous = waypoints
     assert make_waypoints(chain, 0.01, Waypoints.none()).length == pytest.approx(0.4)
+
+
+# --- waypoints through given places ---
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_waypoints_through_the_samples_of_a_centreline_are_its_own(name: str) -> None:
+    made = make_waypoints(at_equal_length(SHAPES[name], 40), 0.006)
+    through = waypoints_through(made.positions, made)
+    np.testing.assert_array_equal(through.positions, made.positions)
+    np.testing.assert_allclose(through.arc_length, chord_knots(made.positions))
+    turned = Rotation.from_quat(through.quaternions) * Rotation.from_quat(made.quaternions).inv()
+    assert np.degrees(turned.magnitude().max()) < 3
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.integers(2, 30), st.integers(0, 10))
+def test_waypoints_through_places_of_which_some_coincide(seed: int, count: int, repeats: int) -> None:
+    rng = np.random.default_rng(seed)
+    chain = wavy(rng, count)
+    again = np.sort(np.concatenate([np.arange(count), rng.integers(0, count, repeats)]))
+    plain, doubled = waypoints_through(chain), waypoints_through(chain[again])
+    np.testing.assert_array_equal(doubled.positions, chain[again])
+    np.testing.assert_allclose(doubled.arc_length, plain.arc_length[again], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(doubled.quaternions, axis=1), 1)
+    along = Rotation.from_quat(doubled.quaternions).as_matrix()[:, :, 0]
+    np.testing.assert_allclose(along, chain_tangents(chain)[again], atol=1e-7)
+
+
+def test_waypoints_that_all_coincide_have_poses_all_the_same() -> None:
+    waypoints = waypoints_through(np.ones((4, 3)))
+    assert waypoints.length == 0
+    np.testing.assert_allclose(np.linalg.norm(waypoints.quaternions, axis=1), 1)
+
+
+def test_the_quaternions_continue_those_before() -> None:
+    chain = wavy(np.random.default_rng(5), 10)
+    first = waypoints_through(chain)
+    flipped = Waypoints(first.positions, -first.quaternions, first.arc_length)
+    np.testing.assert_allclose(waypoints_through(chain, flipped).quaternions, -first.quaternions)

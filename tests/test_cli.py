@@ -168,6 +168,37 @@ def test_results_in_the_world(run: Run, folder: Path, tmp_path: Path) -> None:
     assert float(world["z"]) - float(camera["z"]) == pytest.approx(3.0)
 
 
+def positions(path: Path) -> np.ndarray:
+    return np.array([[float(row[axis]) for axis in "xyz"] for row in rows(path)])
+
+
+def test_predicted_results(run: Run, folder: Path, tmp_path: Path) -> None:
+    common = ["track", folder, "-d", "24mm", "-c", COLOR]
+    assert run(*common, "--out", "plain.csv")[0] == 0
+    assert run(*common, "--predict", "40ms", "--out", "ahead.csv")[0] == 0
+    plain, ahead = rows(tmp_path / "plain.csv"), rows(tmp_path / "ahead.csv")
+    assert [(row["frame"], row["stamp_ns"]) for row in plain] == [(row["frame"], row["stamp_ns"]) for row in ahead]
+    assert {row["vx"] == "" for row in plain if row["frame"] == "0"} == {True}
+    assert {row["vx"] == "" for row in plain if row["frame"] == "5"} == {False}
+    assert {(row["frame"] == "0", row["ahead_ns"]) for row in ahead} == {(True, "0"), (False, "40000000")}
+    moved = np.linalg.norm(positions(tmp_path / "ahead.csv") - positions(tmp_path / "plain.csv"), axis=1)
+    frame = np.array([int(row["frame"]) for row in plain])
+    assert moved[frame == 0].max() == 0
+    assert 0 < moved[frame == 5].max() < 0.1
+    assert run(*common, "--predict", "now", "--out", "now.csv")[0] == 0
+    assert len(rows(tmp_path / "now.csv")) == len(plain)
+
+
+def test_nothing_is_predicted_without_the_motion(run: Run, folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "rope.toml").write_text(f'diameter = "24mm"\ncolor = "{COLOR}"\n[motion]\nmethod = "none"\n')
+    code, _, err = run("track", folder, "--config", "rope.toml", "--predict", "40ms", "--out", "r.csv")
+    assert code == cli.BAD_INPUT
+    assert "--predict needs the motion" in err
+    assert 'motion.method = "none"' in err
+    assert run("track", folder, "--config", "rope.toml", "--out", "r.csv")[0] == 0
+    assert {row["vx"] for row in rows(tmp_path / "r.csv")} == {""}
+
+
 def test_a_mask_replaces_the_colour(run: Run, tmp_path: Path) -> None:
     write_folder(tmp_path / "rope", rope_frames(color=False))
     Image.fromarray(np.full((120, 160), 255, np.uint8)).save(tmp_path / "mask.png")
@@ -201,6 +232,10 @@ def test_a_mask_replaces_the_colour(run: Run, tmp_path: Path) -> None:
         (["track", "{folder}", "-d", "6mm", "--mask", "nowhere.png"], ["nowhere.png"]),
         (["track", "{folder}", "-d", "6mm", "--config", "nowhere.toml"], ["nowhere.toml"]),
         (["track", "{folder}", "-d", "6mm", "--rate", "30"], ["rate"]),
+        (["track", "{folder}", "-d", "6mm", "--predict", "soon"], ["--predict", "soon", "or now"]),
+        (["track", "{folder}", "-d", "6mm", "--predict", "-10ms"], ["--predict", "0 to 1 s"]),
+        (["track", "{folder}", "-d", "6mm", "--predict", "1.5s"], ["--predict 1.5s", "0 to 1 s"]),
+        (["track", "{folder}", "-d", "6mm", "--predict", "nan"], ["--predict"]),
         (["info", "nowhere"], ["nowhere"]),
         (["doctor", "nowhere", "-d", "6mm"], ["nowhere"]),
     ],

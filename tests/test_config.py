@@ -377,6 +377,10 @@ def test_any_text_is_escaped(text: str) -> None:
         ("diameter = 0.01\n[slicing]\nmin_points = true", "slicing.min_points = True: expected a whole number"),
         ("diameter = 0.01\n[slicing]\nmax_nodes = 2", "slicing.max_nodes = 2: expected 4 to 4096"),
         ("diameter = 0.01\n[ordering]\nmethod = 'best'", "ordering.method = 'best': expected one of 'path', 'greedy'"),
+        (
+            "diameter = 0.01\n[motion]\nmethod = 'best'",
+            "motion.method = 'best': expected one of 'arc_length', 'closest', 'none'",
+        ),
         ("diameter = 0.01\n[ordering]\nfollow_previous = 1", "ordering.follow_previous = 1: expected true or false"),
         ("diameter = 0.01\n[segmentation]\nbox_min = [1, 2]", "segmentation.box_min = [1, 2]: expected 3 numbers"),
         ("diameter = 0.01\n[segmentation]\nbox_min = 1", "segmentation.box_min = 1: expected 3 numbers"),
@@ -393,6 +397,16 @@ def test_any_text_is_escaped(text: str) -> None:
 )
 def test_a_bad_file_is_refused_in_words(tmp_path: Path, text: str, message: str) -> None:
     assert message in refused(tmp_path, text)
+
+
+@pytest.mark.parametrize("method", ["arc_length", "closest", "none"])
+def test_the_method_of_motion_is_kept(tmp_path: Path, method: str) -> None:
+    (tmp_path / "rope.toml").write_text(f'diameter = 0.01\n[motion]\nmethod = "{method}"\n')
+    config = RopeConfig.from_toml(tmp_path / "rope.toml")
+    assert config.motion.method == method
+    (tmp_path / "again.toml").write_text(config.to_toml())
+    assert RopeConfig.from_toml(tmp_path / "again.toml") == config
+    assert RopeConfig(diameter=0.01).motion.method == "arc_length"
 
 
 def test_unreadable_files(tmp_path: Path) -> None:

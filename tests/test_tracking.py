@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from helpers import RED_TEXT, SHAPES, SMALL, random_rotation, seen
 from ropetrace.config import RopeConfig
 from ropetrace.errors import OutputError
+from ropetrace.motion.arc_length import ArcLengthMotion
 from ropetrace.trackers import SlicingTracker
-from ropetrace.tracking import Summary, in_world, track_recording
-from ropetrace.types import BadFrame, Cloud, Estimate, Event, Frame, Motion, RgbdFrame, Status, Waypoints
+from ropetrace.tracking import Summary, ahead_of_time, in_world, track_recording, with_motion
+from ropetrace.types import BadFrame, Cloud, Estimate, Event, FloatArray, Frame, Motion, RgbdFrame, Status, Waypoints
 
 HANGING = SHAPES["hanging"]
 CONFIG = RopeConfig(diameter=0.012, color=RED_TEXT)
@@ -200,6 +201,108 @@ def test_a_motion_that_is_not_known_stays_so_in_the_world() -> None:
 def test_a_lost_estimate_stays_lost_in_the_world() -> None:
     lost = in_world(Estimate.lost(3, "why", 5), np.eye(4))
     assert (lost.status, lost.reasons, lost.nodes.shape, lost.point_count) == (Status.LOST, ("why",), (0, 3), 5)
+
+
+# --- motion ---
+
+
+class Recorder:
+    """An estimator of motion that keeps what it is told and moves everything by 1 m/s along x."""
+
+    def __init__(self) -> None:
+        self.told: list[int] = []
+        self.ahead: list[float] = []
+
+    def update(self, stamp_ns: int, waypoints: Waypoints) -> Motion | None:
+        self.told.append(stamp_ns)
+        self._places = waypoints.positions
+        return self._motion() if len(self.told) > 1 else None
+
+    def predict(self, ahead: float) -> tuple[FloatArray, Motion] | None:
+        self.ahead.append(ahead)
+        return self._places + [ahead, 0, 0], self._motion()
+
+    def reset(self) -> None:
+        raise NotImplementedError
+
+    def _motion(self) -> Motion:
+        ones = np.ones_like(self._places)
+        return Motion(ones * [1.0, 0, 0], 0 * ones, ones, ones, ones)
+
+
+def moving(stamps: list[int]) -> list[Event]:
+    return [BadFrame(stamp, "x") if stamp < 0 else good(stamp) for stamp in stamps]
+
+
+def test_motion_is_added_to_frames_that_have_a_rope_and_nothing_else_changes() -> None:
+    plain, known, motion = Keeper(), Keeper(), Recorder()
+    stamps = [10, -20, 30, 40]
+    run(moving(stamps), plain)
+    summary = run(moving(stamps), known, motion=motion)
+    assert motion.told == [10, 30, 40]
+    assert motion.ahead == []
+    assert [estimate.motion is not None for _, estimate, *_ in known.rows] == [False, False, True, True]
+    for (_, before, *_), (_, after, *_) in zip(plain.rows, known.rows, strict=True):
+        np.testing.assert_array_equal(before.waypoints.positions, after.waypoints.positions)
+        assert (after.ahead_ns, after.status) == (0, before.status)
+    assert len(summary.stage_seconds["motion"]) == 4
+
+
+def test_a_prediction_moves_the_waypoints_but_not_the_nodes_or_the_stamp() -> None:
+    now, later = Keeper(), Keeper()
+    run(moving([10, 20]), now, motion=Recorder())
+    run(moving([10, 20]), later, motion=Recorder(), predict=0.05)
+    (_, first, *_), (_, second, *_) = later.rows
+    assert (first.ahead_ns, first.motion) == (0, None), "the first frame has no motion and is handed on as it is"
+    np.testing.assert_array_equal(first.waypoints.positions, now.rows[0][1].waypoints.positions)
+    before = now.rows[1][1]
+    assert (second.ahead_ns, second.stamp_ns) == (50_000_000, 20)
+    np.testing.assert_allclose(second.waypoints.positions, before.waypoints.positions + [0.05, 0, 0])
+    np.testing.assert_array_equal(second.nodes, before.nodes)
+    turned = Rotation.from_quat(second.waypoints.quaternions) * Rotation.from_quat(before.waypoints.quaternions).inv()
+    assert np.degrees(turned.magnitude().max()) < 3
+
+
+def test_a_prediction_for_now_reaches_as_far_as_the_frame_took() -> None:
+    keeper, motion = Keeper(), Recorder()
+    run(moving([10, 20, 30]), keeper, motion=motion, predict="now")
+    assert len(motion.ahead) == 2
+    assert all(1e-5 < ahead < 5 for ahead in motion.ahead)
+    assert [row[1].ahead_ns for row in keeper.rows] == [0, *(round(ahead * 1e9) for ahead in motion.ahead)]
+
+
+def test_a_lost_estimate_has_no_motion_and_is_not_told() -> None:
+    motion, lost = Recorder(), Estimate.lost(3, "why")
+    assert with_motion(lost, motion) is lost
+    assert ahead_of_time(lost, motion, 0.1) is lost
+    assert (motion.told, motion.ahead) == ([], [])
+
+
+def test_an_estimator_that_knows_nothing_of_later_leaves_the_estimate_as_it_is() -> None:
+    class Silent(Recorder):
+        def predict(self, ahead: float) -> tuple[FloatArray, Motion] | None:
+            return None
+
+    waypoints = Waypoints(np.eye(3)[:2], np.tile([0.0, 0, 0, 1], (2, 1)), np.array([0.0, 1.0]))
+    motion = Silent()
+    estimate = with_motion(with_motion(Estimate(1, Status.OK, waypoints=waypoints), motion), motion)
+    assert estimate.motion is not None
+    assert ahead_of_time(estimate, motion, 0.1) is estimate
+
+
+def test_the_motion_and_the_prediction_of_a_rope_that_is_carried_along() -> None:
+    """Through the tracker: 0.3 m/s along x at 30 frames a second."""
+    keeper = Keeper()
+    carried: list[Event] = [seen(HANGING + [0.01 * k, 0, 0], stamp_ns=k * 33_333_333) for k in range(12)]
+    run(carried, keeper, motion=ArcLengthMotion(CONFIG.diameter), predict=0.04)
+    last = keeper.rows[-1][1]
+    assert last.motion is not None
+    np.testing.assert_allclose(last.motion.velocities.mean(axis=0), [0.3, 0, 0], atol=0.03)
+    still = Keeper()
+    run([seen(HANGING + [0.01 * 11 + 0.3 * 0.04, 0, 0])], still)
+    truth = still.rows[0][1].waypoints.positions
+    middles = last.waypoints.positions.mean(axis=0), truth.mean(axis=0)
+    np.testing.assert_allclose(*middles, atol=0.002)
 
 
 # --- the summary ---

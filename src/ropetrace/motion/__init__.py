@@ -20,7 +20,7 @@ class MotionEstimator(Protocol):
     def update(self, stamp_ns: int, waypoints: Waypoints) -> Motion | None:
         """Take the waypoints of a frame.
 
-        A frame that is lost is simply not given. A stamp that repeats or runs back a little adds nothing.
+        A frame that is lost is simply not given. A stamp that repeats or runs back adds nothing, unless it stays so.
 
         Parameters
         ----------
@@ -34,6 +34,11 @@ class MotionEstimator(Protocol):
         Motion or None
             Of these waypoints; None where it is not known: at the first frame, after a pause, in a frame that does not
             fit the ones before.
+
+        Raises
+        ------
+        ValueError
+            If a coordinate is not a finite number.
         """
 
     def predict(self, ahead: float) -> tuple[FloatArray, Motion] | None:

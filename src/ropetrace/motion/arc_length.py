@@ -28,20 +28,26 @@ FEWEST_POINTS = 8
 FIRST_NOISE = 0.04
 """Standard deviation of the points that is assumed until it has been measured, in diameters."""
 
-TIP_NOISE = 0.08
-"""How far the seen tips jitter along the rope, in diameters."""
+LENGTH_CHANGE = 1.5
+"""A visible length that is off by less than this, in diameters, or by `LENGTH_SHARE`, has been measured differently; by
+more, an end has been hidden or uncovered, and the other end is where it was."""
 
-TIP_TOLERANCE = 2.0
-"""Tips that are off by less than this, in diameters, or by `LENGTH_TOLERANCE`, have jittered and are not hidden."""
-
-LENGTH_TOLERANCE = 0.02
+LENGTH_SHARE = 0.015
 """The same as a share of the length."""
+
+LENGTH_MEMORY = 0.07
+"""Time constant with which the visible length is learned, seconds. So an end that is hidden by less than
+`LENGTH_CHANGE` in this time passes for one that moves, and no end does that moves faster."""
+
+TIP_TRUST = 0.75
+"""Share of the tips' shift along the rope that is taken for the rope's: the rest is jitter. If much less were taken,
+the filters would lag behind their own predictions and swing ever further."""
 
 LONGEST_PAUSE = 0.25
 """After a longer one nothing is left of the motion, seconds."""
 
 MOST_MISSED = 2
-"""Frames in a row that may not fit what was expected; the next one is believed."""
+"""Frames in a row that may be late or not fit what was expected; the next one is believed."""
 
 VELOCITY_SMOOTHING, ACCELERATION_SMOOTHING = 300.0, 1e4
 """Of the fields along the rope, see `filters.smoothing_factor`: waves shorter than 16 and 29 points are noise."""
@@ -63,50 +69,43 @@ class ArcLengthMotion:
     def reset(self) -> None:
         """Forget the frames so far."""
         self._stamp_ns: int | None = None
-        self._updates = 0
         self._missed = 0
         self._known = False
-        self._count = filters.PRIOR_COUNT
+        self._count = 0.0
 
     def update(self, stamp_ns: int, waypoints: Waypoints) -> Motion | None:
         """Take the waypoints of a frame; see `motion.MotionEstimator.update`."""
         self._known = False
-        if len(waypoints) < 2 or waypoints.length <= 0:
+        if not np.isfinite(waypoints.positions).all():
+            raise ValueError("waypoints: a coordinate is not a finite number")
+        if waypoints.length <= 0:
             return None
         dt = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
         if self._stamp_ns is None or abs(dt) > LONGEST_PAUSE:
             self._start(stamp_ns, waypoints)
-            return None
-        if dt < 0:
             return None
         if dt > 0:
             self._stamp_ns = stamp_ns
             self._unseen += dt
             filters.advance(self._states, self._spreads, dt)
             filters.mixture(self._states, self._spreads, self._noise, self._weights, self._means, self._covariances)
-        if not self._lay_on(waypoints):
+        if dt <= 0 or not self._lay_on(waypoints, dt):
             self._missed += 1
             if self._missed > MOST_MISSED:
                 self._start(stamp_ns, waypoints)
             return None
-        if dt > 0:
-            self._missed = 0
-            self._count = filters.correct(
-                self._states, self._spreads, self._evidence, self._surprise, self._count, self._points, self._measured
-            )
-            filters.weigh(self._evidence, self._surprise, self._count, self._noise, self._weights)
-            filters.mixture(self._states, self._spreads, self._noise, self._weights, self._means, self._covariances)
-            self._unseen[self._measured] = 0.0
-            self._updates += 1
+        self._missed = 0
+        self._count = filters.correct(
+            self._states, self._spreads, self._evidence, self._surprise, self._count, self._points, self._measured
+        )
+        filters.weigh(self._evidence, self._surprise, self._count, self._noise, self._weights)
+        filters.mixture(self._states, self._spreads, self._noise, self._weights, self._means, self._covariances)
+        self._unseen[self._measured] = 0.0
         self._waypoints = waypoints
-        self._known = self._updates > 0
-        if not self._known:
-            return None
+        self._known = True
+        self._fit_grid()
         self._smooth_fields()
-        motion = self._at_waypoints(0.0)[1]
-        if dt > 0:
-            self._fit_grid()
-        return motion
+        return self._at_waypoints(0.0)[1]
 
     def predict(self, ahead: float) -> tuple[FloatArray, Motion] | None:
         """Where the waypoints of the last update are `ahead` seconds later; see `motion.MotionEstimator.predict`."""
@@ -118,7 +117,7 @@ class ArcLengthMotion:
         length = waypoints.length
         count = int(np.clip(round(length / (SPACING * self._diameter)) + 1, FEWEST_POINTS, MOST_POINTS))
         self._stamp_ns = stamp_ns
-        self._updates = self._missed = 0
+        self._missed = 0
         self._arcs = np.linspace(0.0, length, count)
         self._extent = (0.0, length)
         self._count = filters.PRIOR_COUNT
@@ -151,31 +150,29 @@ class ArcLengthMotion:
         self._velocity_factor = filters.smoothing_factor(count, VELOCITY_SMOOTHING)
         self._acceleration_factor = filters.smoothing_factor(count, ACCELERATION_SMOOTHING)
 
-    def _lay_on(self, waypoints: Waypoints) -> bool:
+    def _lay_on(self, waypoints: Waypoints, dt: float) -> bool:
         """Find which arc length of the curve each followed point has, and its place; whether they fit."""
-        d = self._diameter
-        tolerance = max(TIP_TOLERANCE * d, LENGTH_TOLERANCE * self._arcs[-1])
-        start, end, reverse = _lay_on(
+        span = self._arcs[-1] - self._arcs[0]
+        start, end, fits = _lay_on(
             self._means[:, 0],
-            self._covariances,
             self._arcs,
-            self._extent[0],
-            self._extent[1],
+            *self._extent,
             waypoints.positions,
             waypoints.arc_length,
-            TIP_NOISE * d,
-            tolerance,
+            max(LENGTH_CHANGE * self._diameter, LENGTH_SHARE * span),
             self._points,
             self._measured,
         )
-        if reverse:
+        seen = np.count_nonzero(self._measured)
+        lost = filters.outliers(
+            self._means, self._covariances, self._points, self._unseen, self._diameter / 2, self._measured
+        )
+        if not fits or 3 * lost >= seen:
             return False
-        seen = int(np.count_nonzero(self._measured))
-        if seen < 2:
-            return False
-        lost = filters.outliers(self._states, self._spreads, self._noise, self._points, d / 2, self._measured)
-        if lost > seen / 3:
-            return False
+        if (start, end) == (self._arcs[0], self._arcs[-1]):
+            growth = -np.expm1(-dt / LENGTH_MEMORY) * (waypoints.length / span - 1)
+            self._arcs += growth * (self._arcs - start)
+            end = self._arcs[-1]
         self._extent = (start, end)
         return True
 
@@ -195,9 +192,6 @@ class ArcLengthMotion:
             self._extent[0],
             self._extent[1],
             self._arcs,
-            self._points,
-            self._measured,
-            self._means,
             self._velocities,
             self._accelerations,
             self._covariances,
@@ -209,18 +203,10 @@ class ArcLengthMotion:
 
     def _fit_grid(self) -> None:
         """Follow the visible part: drop what has been hidden for long, take what has come into view."""
-        spacing = self._arcs[1] - self._arcs[0]
-        kept = np.flatnonzero(self._unseen <= LONGEST_PAUSE)
-        low, high = self._arcs[kept[0]], self._arcs[kept[-1]]
-        if len(kept) == len(self._arcs) and self._extent == (self._arcs[0], self._arcs[-1]):
-            return
-        low, high = min(low, self._extent[0]), max(high, self._extent[1])
-        if high - low < 2 * spacing:
-            self.reset()
-            return
-        if (low, high) == (self._arcs[0], self._arcs[-1]):
-            return
-        self._regrid(low, high)
+        kept = self._arcs[self._unseen <= LONGEST_PAUSE]
+        low, high = min(kept[0], self._extent[0]), max(kept[-1], self._extent[1])
+        if (low, high) != (self._arcs[0], self._arcs[-1]):
+            self._regrid(low, high)
 
     def _regrid(self, low: float, high: float) -> None:
         old = self._arcs, self._states, self._spreads, self._evidence, self._surprise, self._unseen
@@ -238,18 +224,13 @@ class ArcLengthMotion:
         self._unseen[:] = np.maximum(unseen[before], unseen[before + 1])
         # New points are where they are seen, and move as the nearest that is known, as far as anyone can tell.
         fresh = (self._arcs < arcs[0] - 1e-9) | (self._arcs > arcs[-1] + 1e-9)
-        scale = self._waypoints.length / max(self._extent[1] - self._extent[0], 1e-9)
+        scale = self._waypoints.length / (self._extent[1] - self._extent[0])
         seen_at = (self._arcs - self._extent[0]) * scale
-        places = np.empty((count, 3))
-        _sample(self._waypoints.positions, self._waypoints.arc_length, seen_at, places)
-        self._states[:, fresh, 0] = places[fresh]
+        _sample(self._waypoints.positions, self._waypoints.arc_length, seen_at, self._points)
+        self._states[:, fresh, 0] = self._points[fresh]
         self._spreads[:, fresh] = _unknown((FIRST_NOISE * self._diameter) ** 2)
-        self._unseen[fresh] = 0.0
         filters.weigh(self._evidence, self._surprise, self._count, self._noise, self._weights)
         filters.mixture(self._states, self._spreads, self._noise, self._weights, self._means, self._covariances)
-        self._points[:] = places
-        self._measured[:] = (seen_at >= -1e-9) & (seen_at <= self._waypoints.length + 1e-9)
-        self._smooth_fields()
 
 
 def _unknown(variance: float) -> NDArray[np.float64]:
@@ -281,35 +262,29 @@ def _sample(positions: Any, arcs: Any, at: Any, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _misfit(points: Any, arcs: Any, positions: Any, lengths: Any, offset: float, scale: float, beyond: float) -> float:
+def _misfit(points: Any, arcs: Any, positions: Any, lengths: Any, offset: float, scale: float) -> float:
     """Mean squared distance of the points to the curve at ``offset + scale arc``, of those that are on it."""
     here = np.empty(3)
     total, count, segment = 0.0, 0, 0
     for n in range(len(points)):
         at = offset + scale * arcs[n]
-        if at < -beyond or at > lengths[-1] + beyond:
+        if not 0.0 <= at <= lengths[-1]:
             continue
         segment = _place(positions, lengths, at, segment, here)
         for c in range(3):
             total += (here[c] - points[n, c]) ** 2
         count += 1
-    return total / count if count >= 3 else np.inf
-
-
-_PREFER_WHOLE = 0.7
-"""Another way to lay the curve must be better than this share of the misfit of the usual one."""
+    return total / count if count else np.inf
 
 
 @njit(cache=True, nogil=True)
 def _lay_on(
     means: Any,
-    covariances: Any,
     arcs: Any,
     first: float,
     last: float,
     positions: Any,
     lengths: Any,
-    jitter: float,
     tolerance: float,
     points: Any,
     measured: Any,
@@ -318,29 +293,26 @@ def _lay_on(
 
     Parameters
     ----------
-    means : (N, 3) predicted points; covariances (N, 3, 6); arcs (N,) their arc lengths.
+    means : (N, 3) predicted points; arcs (N,) their arc lengths.
     first, last : arc lengths at which the visible part began and ended so far.
     positions (W, 3), lengths (W,) : the new curve.
-    jitter, tolerance : metres, see `TIP_NOISE` and `TIP_TOLERANCE`.
+    tolerance : metres, see `LENGTH_CHANGE`.
     points (N, 3), measured (N,) : what is found.
 
     Returns
     -------
-    The new first and last, and whether the curve rather runs the other way.
+    The new first and last, and whether the curve fits: not if it runs the other way.
     """
     count, length = len(arcs), lengths[-1]
-    whole_scale = length / max(last - first, 1e-9)
-    whole_offset = -first * whole_scale
-    offset, scale = whole_offset, whole_scale
-    best = _misfit(means, arcs, positions, lengths, offset, scale, jitter)
-    backward = _misfit(means, arcs, positions, lengths, length - whole_offset, -whole_scale, jitter)
-    least = _PREFER_WHOLE * best
+    scale, offset, least = 1.0, -first, np.inf
     for candidate in (-first, length - last):
-        misfit = _misfit(means, arcs, positions, lengths, candidate, 1.0, 0.0)
+        misfit = _misfit(means, arcs, positions, lengths, candidate, 1.0)
         if misfit < least:
-            least, offset, scale = misfit, candidate, 1.0
-    if backward < 0.25 * min(least, best) and min(least, best) > tolerance * tolerance:
-        return first, last, True
+            least, offset = misfit, candidate
+    if least > tolerance * tolerance:
+        for candidate in (last, length + first):
+            if _misfit(means, arcs, positions, lengths, candidate, -1.0) < 0.25 * least:
+                return first, last, False
 
     tangent, here = np.empty(3), np.empty(3)
     for _ in range(2):
@@ -367,33 +339,32 @@ def _lay_on(
             r0 += along
             r1 += along * u
         across = s0 * s2 - s1 * s1
-        if s0 < 3 or across <= 1e-12 * s2 * s0:
-            break
+        if across <= 1e-12 * s2 * s0:
+            return first, last, False
         offset += (s2 * r0 - s1 * r1) / across
         scale += (s0 * r1 - s1 * r0) / across
-    if not 0.5 < scale < 2.0:
-        offset, scale = whole_offset, whole_scale
 
-    # How much of the shift is the rope's own motion: no more than the filters hold possible.
-    possible = shift = 0.0
-    for n in range(count):
-        possible += (covariances[n, 0, 0] + covariances[n, 1, 0] + covariances[n, 2, 0]) / 3
-        shift += (offset - whole_offset + (scale - whole_scale) * arcs[n]) ** 2
-    possible, shift = possible / count, shift / count
-    gain = possible / (possible + jitter * jitter + shift / 36)
-    offset += gain * (whole_offset - offset)
-    scale += gain * (whole_scale - scale)
+    # The tips tell where the ends are: both if the length is what it was, else the one that has not moved.
+    span = arcs[-1] - arcs[0]
+    keeps_start = abs(offset + scale * first) < abs(offset + scale * last - length)
+    whole = 1.0 / (1.0 + ((length - span) / tolerance) ** 6)
+    tip_scale = whole * length / span + 1.0 - whole
+    tip_offset = -whole * arcs[0] * length / span + (1.0 - whole) * (-first if keeps_start else length - last)
+    offset += TIP_TRUST * (tip_offset - offset)
+    scale += TIP_TRUST * (tip_scale - scale)
 
     start, end = -offset / scale, (length - offset) / scale
-    if abs(start - arcs[0]) < tolerance:
-        start = arcs[0]
-    if abs(end - arcs[-1]) < tolerance:
-        end = arcs[-1]
+    if whole > 0.5:
+        start, end = arcs[0], arcs[-1]
+    elif keeps_start:
+        start = first
+    else:
+        end = last
     segment = 0
     for n in range(count):
         measured[n] = start - 1e-9 <= arcs[n] <= end + 1e-9
         segment = _place(positions, lengths, offset + scale * arcs[n], segment, points[n])
-    return start, end, False
+    return start, end, True
 
 
 @njit(cache=True, nogil=True)
@@ -403,9 +374,6 @@ def _at_waypoints(
     first: float,
     last: float,
     arcs: Any,
-    points: Any,
-    measured: Any,
-    means: Any,
     velocities: Any,
     accelerations: Any,
     covariances: Any,
@@ -413,7 +381,10 @@ def _at_waypoints(
     ahead: float,
     out: Any,
 ) -> None:
-    """Position, velocity, acceleration and their standard deviations at the waypoints, (W, 6, 3)."""
+    """Position, velocity, acceleration and their standard deviations at the waypoints, (W, 6, 3).
+
+    A waypoint is where it was seen and then moves as the points beside it.
+    """
     count = len(arcs)
     f01, f02, f12, f22 = filters.transition(ahead)
     fields = np.empty((count, 6, 3))
@@ -422,9 +393,7 @@ def _at_waypoints(
             p = covariances[n, c]
             q = density[n, c]
             v, a = velocities[n, c], accelerations[n, c]
-            # A prediction moves the waypoint by what the point moves; a point that was seen is where it was seen.
-            settled = means[n, 0, c] - points[n, c] if measured[n] and ahead > 0 else 0.0
-            fields[n, 0, c] = settled + f01 * v + f02 * a
+            fields[n, 0, c] = f01 * v + f02 * a
             fields[n, 1, c] = v + f12 * a
             fields[n, 2, c] = f22 * a
             pp = p[0] + 2 * f01 * p[1] + 2 * f02 * p[2]

@@ -52,6 +52,8 @@ class ClosestMotion:
     def update(self, stamp_ns: int, waypoints: Waypoints) -> Motion | None:
         """Take the waypoints of a frame; see `motion.MotionEstimator.update`."""
         self._motion = None
+        if not np.isfinite(waypoints.positions).all():
+            raise ValueError("waypoints: a coordinate is not a finite number")
         if not len(waypoints):
             return None
         dt = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9

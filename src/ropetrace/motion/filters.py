@@ -32,8 +32,11 @@ FIRST_VELOCITY, FIRST_ACCELERATION = 3.0, 30.0
 NEIGHBOURS = 5.0
 """How far along the rope evidence is shared, in points."""
 
-OUTLIER = 6.0
-"""A point further than this many standard deviations from where the most agile filter expects it is left out."""
+OUTLIER = 4.0
+"""A point further than this many standard deviations from where it is expected is left out ..."""
+
+HARDEST = 50.0
+"""... unless a change of its acceleration by this much, m/s^2, explains it: a jerk of the hand does."""
 
 
 @njit(cache=True, nogil=True)
@@ -75,19 +78,20 @@ def advance(states: Any, spreads: Any, dt: float) -> None:
 
 
 @njit(cache=True, nogil=True)
-def outliers(states: Any, spreads: Any, noise: Any, points: Any, floor: float, measured: Any) -> int:
-    """Clear the mask `measured` (N,) where a point is not where even the most agile filter allows it; how many."""
+def outliers(means: Any, covariances: Any, points: Any, unseen: Any, floor: float, measured: Any) -> int:
+    """Clear the mask `measured` (N,) where a point is not where the filters together allow it; how many.
+
+    unseen (N,) is the time since each was measured, seconds; `floor`, metres, is never too far.
+    """
     count = 0
-    k = len(states) - 1
     for n in range(len(points)):
         if not measured[n]:
             continue
-        far = away = 0.0
+        away = allowed = 0.0
         for c in range(3):
-            off = (points[n, c] - states[k, n, 0, c]) ** 2
-            away += off
-            far += off / ((spreads[k, n, 0] + 1.0) * noise[k, n, c])
-        if away > floor * floor and far > OUTLIER * OUTLIER * 3:
+            away += (points[n, c] - means[n, 0, c]) ** 2
+            allowed += OUTLIER**2 * covariances[n, c, 0]
+        if away > allowed + (floor + HARDEST / 2 * unseen[n] ** 2) ** 2:
             measured[n] = False
             count += 1
     return count
