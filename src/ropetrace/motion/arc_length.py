@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ropetrace.motion import filters
+from ropetrace.motion.inextensible import make_inextensible
 from ropetrace.types import FloatArray, Motion, Waypoints
 
 SPACING = 1.25
@@ -181,6 +182,8 @@ class ArcLengthMotion:
         self._accelerations[:] = self._means[:, 2]
         filters.smooth(self._velocity_factor, self._velocities)
         filters.smooth(self._acceleration_factor, self._accelerations)
+        places = np.ascontiguousarray(self._means[:, 0])
+        make_inextensible(places, self._velocities, self._accelerations, self._measured)
         filters.jerk_density(self._noise, self._weights, self._density)
 
     def _at_waypoints(self, ahead: float) -> tuple[FloatArray, Motion]:

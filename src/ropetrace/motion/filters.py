@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-DECAY = 0.1
+DECAY = 0.3
 """Time constant of the acceleration, seconds."""
 
 AGILITIES = np.geomspace(3e2, 1e6, 8)
