@@ -21,9 +21,10 @@ pytest.importorskip("mujoco")
 
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
 from ropetrace.evaluation import case_files, runner
-from ropetrace.evaluation.case1 import CONDITIONS, Case1Settings, Readings, frame_stamps, run_case, schedule
-from ropetrace.evaluation.case_files import Case, Case1Folder, choose_cases
-from ropetrace.evaluation.report import COLUMNS, csv_text, report_text, summary_table, write_report
+from ropetrace.evaluation.case1 import CONDITIONS, Case, Case1Settings, Readings, frame_stamps, run_case, schedule
+from ropetrace.evaluation.case1_report import COLUMNS, csv_text, report_text, summary_table, write_report
+from ropetrace.evaluation.case_files import CaseFolder
+from ropetrace.evaluation.experiments import CASE1, choose_cases
 from ropetrace.evaluation.runner import run_cases
 
 REAL_TIME, SLOW_MOTION = CONDITIONS
@@ -124,7 +125,7 @@ def test_cases_are_checked_before_they_run() -> None:
 def run_in(path: Path, settings: Case1Settings = SHORT, overwrite: bool = False, **options: str) -> bytes:
     """Two cases, side by side; the bytes of their readings."""
     cases = choose_cases(settings, ["30fps"], [0.0, 0.8])
-    folder = Case1Folder(path)
+    folder = CaseFolder(path, CASE1)
     times = folder.begin(settings, [REAL_TIME], overwrite)
     counts: list[int] = []
     run_cases(folder, cases, settings, times, on_progress=counts.append, jobs=2, **options)
@@ -157,10 +158,10 @@ def test_the_compute_time_is_measured_once(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(case_files, "measure_compute_time", measure)
     settings = replace(SHORT, latency=None)
-    folder = Case1Folder(tmp_path / "case1")
+    folder = CaseFolder(tmp_path / "case1", CASE1)
     assert folder.begin(settings, [REAL_TIME]) == {"30fps": 0.001}
     assert folder.begin(settings, CONDITIONS) == {"30fps": 0.001, "60fps": 0.002}
-    assert Case1Folder(tmp_path / "case1").begin(settings, CONDITIONS) == {"30fps": 0.001, "60fps": 0.002}
+    assert CaseFolder(tmp_path / "case1", CASE1).begin(settings, CONDITIONS) == {"30fps": 0.001, "60fps": 0.002}
     assert len(measured) == 2
     assert folder.begin(settings, [REAL_TIME], overwrite=True) == {"30fps": 0.003}
 
@@ -168,14 +169,14 @@ def test_the_compute_time_is_measured_once(tmp_path: Path, monkeypatch: pytest.M
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "letter.txt").write_text("dear")
     with pytest.raises(OutputError, match=r"no settings\.toml"):
-        Case1Folder(tmp_path).begin(SHORT, [REAL_TIME])
+        CaseFolder(tmp_path, CASE1).begin(SHORT, [REAL_TIME])
     with pytest.raises(OutputError, match="is a file"):
-        Case1Folder(tmp_path / "letter.txt").begin(SHORT, [REAL_TIME])
+        CaseFolder(tmp_path / "letter.txt", CASE1).begin(SHORT, [REAL_TIME])
     assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
 
 
 def test_a_damaged_case_is_named(tmp_path: Path) -> None:
-    folder, case = Case1Folder(tmp_path / "case1"), Case(REAL_TIME, 0.8)
+    folder, case = CaseFolder(tmp_path / "case1", CASE1), Case(REAL_TIME, 0.8)
     folder.begin(SHORT, [REAL_TIME])
     folder.case_path(case).write_bytes(b"PK\x03\x04 no")
     with pytest.raises(OutputError, match=r"30fps_0\.8\.npz: cannot be read"):
@@ -236,7 +237,7 @@ def test_ctrl_c_keeps_finished_cases_and_says_so_in_one_line(tmp_path: Path) -> 
 
 def test_a_case_that_fails_is_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "version", lambda name: "0.0.0")
-    folder = Case1Folder(tmp_path / "case1")
+    folder = CaseFolder(tmp_path / "case1", CASE1)
     cases = choose_cases(SHORT, ["30fps"], [0.8])
     with pytest.raises(RopetraceError, match=r"a worker has ropetrace .*, not 0\.0\.0"):
         run_cases(folder, cases, SHORT, folder.begin(SHORT, [REAL_TIME]))

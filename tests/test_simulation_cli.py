@@ -157,6 +157,13 @@ def test_an_impossible_scenario_is_refused_before_anything_is_written(tmp_path: 
         (Reproduce("case1", phase=1.5), "phase"),
         (Reproduce("case1", frequencies=(13.0,)), "resolves"),
         (Reproduce("case1", jobs=0), "--jobs 0"),
+        (Reproduce("case1", placement="behind"), "--placement means nothing for case1"),
+        (Reproduce("case2", predict="now"), "--predict means nothing for case2"),
+        (Reproduce("case2", phase=0.5), "--phase means nothing for case2"),
+        (Reproduce("case2", noise="fog"), "noise model"),
+        (Reproduce("case2", latency="-1ms"), "latency"),
+        (Reproduce("case2", frequencies=(13.0,)), "resolves"),
+        (Reproduce("case2", jobs=0), "--jobs 0"),
     ],
 )
 def test_what_cannot_be_is_one_line_and_leaves_nothing(
@@ -226,6 +233,26 @@ def test_reproduce_prints_the_table_and_the_paths(
         assert f"out/{name}" in said
         assert (tmp_path / "out" / name).stat().st_size > 100
     assert len((tmp_path / "out" / "case1.csv").read_text().splitlines()) == 6
+
+
+def test_reproduce_case2_prints_the_table_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("pinocchio")
+    monkeypatch.chdir(tmp_path)
+    command = Reproduce("case2", quick=True, conditions=("30fps",), frequencies=(0.0,), latency="1ms", jobs=1)
+    assert command.run() == 0
+    said = capsys.readouterr().out
+    assert "1 of 1" in said
+    for name in ("case2.csv", "case2.md", "case2.png"):
+        assert f"case2/{name}" in said
+        assert (tmp_path / "case2" / name).stat().st_size > 100
+    before = (tmp_path / "case2" / "case2.md").read_bytes()
+    assert command.run() == 0
+    assert (tmp_path / "case2" / "case2.md").read_bytes() == before
+    assert capsys.readouterr().out == said
+    with pytest.raises(ConfigError, match="begun with other settings"):
+        dataclasses.replace(command, placement="beside_camera").run()
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("40ms", 0.04), ("0.04s", 0.04), (" 0.04 ", 0.04), ("1e-3 s", 0.001)])

@@ -17,7 +17,10 @@ from ropetrace.errors import ConfigError, import_extra
 from ropetrace.terminal import INTERRUPTED, progress_bar
 
 QUICK_SECONDS = 10.0
-"""Of a case, with --quick."""
+"""Of a case of case1, with --quick."""
+
+QUICK_FREQUENCIES = (0.0, 0.8, 1.6)
+"""Of the wind in case2, with --quick, Hz."""
 
 
 @dataclass(frozen=True)
@@ -85,12 +88,13 @@ class Reproduce:
     ropetrace reproduce case1 --quick
     """
 
-    experiment: Positional[Literal["case1"]]
-    """case1: the error of the tracker on a rope that sways in a wind (section 6.2, Figure 4)."""
+    experiment: Positional[Literal["case1", "case2"]]
+    """case1: the error of the tracker on a rope that sways in a wind (section 6.2, Figure 4). case2: a simulated arm
+    traces that rope (section 6.3, Figure 6)."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="PATH")] = None
     """The folder for the results; by default the name of the experiment."""
     quick: bool = False
-    """10 s of simulated time a case in the place of 300 s."""
+    """case1: 10 s of simulated time a case in the place of 300 s. case2: one tracing a case, at 0, 0.8 and 1.6 Hz."""
     conditions: tuple[Literal["30fps", "60fps"], ...] = ("30fps", "60fps")
     """30fps: 480x360 in real time; 60fps: 1280x720 in a tenth of real time. The report shows those chosen."""
     frequencies: Annotated[tuple[float, ...] | None, arg(metavar="HZ ...")] = None
@@ -99,11 +103,15 @@ class Reproduce:
     """Of the depth camera: none (as in the paper), kinect_v1, stereo, kinect_v1_edges, stereo_edges."""
     latency: Annotated[str | None, arg(metavar="DURATION")] = None
     """From a frame's arrival to its centreline, such as 40ms of simulated time; by default measured on this machine."""
-    predict: Literal["none", "now"] = "none"
-    """now: each reading asks for the centreline of its own moment, predicted from what is available then."""
+    predict: Literal["none", "now"] | None = None
+    """case1 only. now: each reading asks for the centreline of its own moment, predicted from what is available then;
+    by default none. The arm of case2 always predicts."""
     phase: float | None = None
-    """When frames come, in frame intervals after a reading, 0 to 1; 0 is the worst. By default every phase comes
-    equally often, as from a camera that nobody synchronises."""
+    """case1 only. When frames come, in frame intervals after a reading, 0 to 1; 0 is the worst. By default every phase
+    comes equally often, as from a camera that nobody synchronises."""
+    placement: Literal["behind", "beside_camera"] | None = None
+    """case2 only. Where the arm stands: behind the rope as seen from the camera (by default), or beside the camera,
+    where its hand hides part of the rope."""
     jobs: Annotated[int | None, arg(aliases=["-j"], metavar="N")] = None
     """Cases at a time; by default as many as there are cores."""
     cluster: Annotated[str | None, arg(metavar="ADDRESS")] = None
@@ -114,22 +122,28 @@ class Reproduce:
     def run(self) -> int:
         import_extra("matplotlib", "sim")  # not after minutes of work
         import_extra("mujoco", "sim")
-        from ropetrace.evaluation.case1 import FREQUENCIES, Case1Settings
-        from ropetrace.evaluation.case_files import Case1Folder, choose_cases
-        from ropetrace.evaluation.report import summary_table, write_report
+        from ropetrace.evaluation import case1_report, case2_report
+        from ropetrace.evaluation.case1 import FREQUENCIES
+        from ropetrace.evaluation.case_files import CaseFolder
+        from ropetrace.evaluation.experiments import CASE1, CASE2, Experiment, choose_cases
         from ropetrace.evaluation.runner import check_engine, run_cases
 
-        settings = Case1Settings(
-            duration=QUICK_SECONDS if self.quick else Case1Settings().duration,
-            noise=self.noise,
-            predict=self.predict,
-            phase=self.phase,
-            latency=None if self.latency is None else parse_duration(self.latency),
+        experiment: Experiment[Any, Any]
+        report: Any
+        if self.experiment == "case1":
+            experiment, report, settings = CASE1, case1_report, self._case1()
+        else:
+            import_extra("pinocchio", "arm")
+            experiment, report, settings = CASE2, case2_report, self._case2()
+        few = self.quick and self.experiment == "case2"
+        cases = choose_cases(
+            settings,
+            self.conditions,
+            (QUICK_FREQUENCIES if few else FREQUENCIES) if self.frequencies is None else self.frequencies,
         )
-        cases = choose_cases(settings, self.conditions, FREQUENCIES if self.frequencies is None else self.frequencies)
         check_engine(self.jobs, self.cluster)
         out = Path(self.experiment) if self.out is None else self.out
-        folder = Case1Folder(out)
+        folder: CaseFolder[Any, Any] = CaseFolder(out, experiment)
         try:
             times = folder.begin(settings, [*dict.fromkeys(case.condition for case in cases)], self.overwrite)
             with _progress(len(cases), "case") as advance:
@@ -140,12 +154,41 @@ class Reproduce:
             print(f"ropetrace: interrupted; {done} are finished and kept in {out}", file=sys.stderr)
             return INTERRUPTED
         results = {case: folder.load(case) for case in cases}
-        paths = write_report(out, results, settings, times)
-        print(summary_table(results))
+        paths = report.write_report(out, results, settings, times)
+        print(report.summary_table(results))
         print()
         for name, path in zip(("readings", "report", "figure"), paths, strict=True):
             print(f"{name:9} {path}")
         return 0
+
+    def _case1(self) -> Any:
+        from ropetrace.evaluation.case1 import Case1Settings
+
+        self._refuse("placement")
+        return Case1Settings(
+            duration=QUICK_SECONDS if self.quick else Case1Settings().duration,
+            noise=self.noise,
+            predict=self.predict or "none",
+            phase=self.phase,
+            latency=None if self.latency is None else parse_duration(self.latency),
+        )
+
+    def _case2(self) -> Any:
+        from ropetrace.evaluation.case2 import Case2Settings
+
+        self._refuse("predict", "phase")
+        return Case2Settings.at(
+            self.placement or "behind",
+            tracings=1 if self.quick else Case2Settings().tracings,
+            noise=self.noise,
+            latency=None if self.latency is None else parse_duration(self.latency),
+        )
+
+    def _refuse(self, *options: str) -> None:
+        """Those that mean nothing for this experiment."""
+        for name in options:
+            if getattr(self, name) is not None:
+                raise ConfigError(f"--{name} means nothing for {self.experiment}: leave it out")
 
 
 def parse_duration(text: str) -> float:

@@ -66,6 +66,20 @@ CONDITIONS = (Condition("30fps", 480, 360, 30.0, 1.0), Condition("60fps", 1280, 
 
 
 @dataclass(frozen=True, slots=True)
+class Case:
+    """A camera condition, a frequency of the wind, Hz, and which repetition where there are several, from 0."""
+
+    condition: Condition
+    frequency: float
+    repeat: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Such as 30fps_0.8, or 30fps_0.8_1 for the first of several."""
+        return f"{self.condition.name}_{self.frequency!r}" + ("" if self.repeat is None else f"_{self.repeat + 1}")
+
+
+@dataclass(frozen=True, slots=True)
 class Case1Settings:
     """What is run; the defaults are the paper's."""
 

@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from ropetrace.config import RopeConfig, Vector
 from ropetrace.control.arm import Arm
 from ropetrace.control.controller import Control, TracingController
 from ropetrace.control.kinematics import manipulability
-from ropetrace.control.limits import GuardOptions, Reason, ToolLimits
+from ropetrace.control.limits import Command, GuardOptions, Reason, ToolLimits
 from ropetrace.control.tracing import Phase, TracingSettings
 from ropetrace.errors import ConfigError
 from ropetrace.evaluation.case1 import Case1Settings, Condition, rope_config, scenario, schedule
@@ -54,11 +54,11 @@ limit of its Cartesian interfaces, and the arm is driven by joint velocities."""
 class Placement:
     """Where the arm stands and how it starts; the default is on the far side of the rope from the camera."""
 
-    base: Vector = (-0.20, 0.45, 0.60)
+    base: Vector = (-0.183, 0.461, 0.586)
     """World frame, metres."""
-    yaw_degrees: float = -90.0
+    yaw_degrees: float = -100.9
     """Of the base about the vertical."""
-    start: tuple[float, ...] = (1.424, -0.533, -0.844, -2.798, -2.498, 1.925, 0.332)
+    start: tuple[float, ...] = (2.6544, 0.8773, -1.9534, -2.6192, -2.5844, 2.6956, 1.0956)
     """Joint angles with the tool at the top of the rope, rad."""
 
     def world_from_base(self) -> FloatArray:
@@ -67,6 +67,15 @@ class Placement:
         pose[:3, :3] = Rotation.from_euler("z", self.yaw_degrees, degrees=True).as_matrix()
         pose[:3, 3] = self.base
         return pose
+
+
+PLACEMENTS = {
+    "behind": Placement(),
+    "beside_camera": Placement(
+        (0.591, -0.267, 0.13), -165.8, (2.1336, -0.3582, -2.1872, -1.0611, -1.8946, 1.498, -1.0699)
+    ),
+}
+"""By name: where equations 15-17 want the arm, and on the camera's side, where its hand hides part of the rope."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,9 +104,28 @@ class Case2Settings:
             raise ConfigError(f"tracings = {self.tracings}: expected 1 to 1000")
         if not 0 < self.longest <= 600:
             raise ConfigError(f"longest = {self.longest} s: expected more than 0, and 600 s at most")
-        if self.interval < 1 / CONTROL_RATE:
-            raise ConfigError(f"interval = {self.interval} s: expected {1 / CONTROL_RATE:.4f} s or more")
+        steps = self.interval * CONTROL_RATE
+        if steps < 1 or abs(steps - round(steps)) > 1e-6:
+            raise ConfigError(f"interval = {self.interval} s: expected a multiple of the period, 1/{CONTROL_RATE:g} s")
         self.as_case1()
+
+    @classmethod
+    def at(cls, placement: str, **others: Any) -> Self:
+        """With the arm at one of `PLACEMENTS`.
+
+        Beside the camera the tool is turned round, and hides what it reaches for: 3 cm from it is near enough there.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such placement, or another setting is impossible.
+        """
+        if placement not in PLACEMENTS:
+            raise ConfigError(f"unknown placement {placement!r}: choose of {', '.join(PLACEMENTS)}")
+        settings = cls(placement=PLACEMENTS[placement], **others)
+        if placement == "behind":
+            return settings
+        return replace(settings, tracing=replace(settings.tracing, approach="from_camera", reach=0.03))
 
     def as_case1(self) -> Case1Settings:
         """The settings that both experiments share."""
@@ -124,8 +152,10 @@ class Tracing:
         From the tool to the true rope, metres and rad: the paper's errors.
     place : (R,) float array
         Share of the rope's length at which the tool is.
+    visible : (R,) float array
+        Share of the rope's length that the camera sees.
     outcome : str
-        A `Phase`, or why the guard stopped the arm for good.
+        A `Phase`, why the guard stopped the arm for good, or that it took too long.
     approach, duration : float
         Of the way to the first waypoint, and of the tracing, seconds.
     manipulability : float
@@ -139,15 +169,16 @@ class Tracing:
     limited : float
         Share of the control steps in which the guard could not grant the wish.
     braked : str
-        Reasons for which the guard braked meanwhile, with their counts; empty if none.
+        Reasons for which the guard braked before the end, with the control steps of each; empty if none.
     traced : float
-        Share of the rope's length that the tool has come past, within `TracingSettings.max_distance`.
+        Share of the rope's length that the tool has come past, no further off than `TracingSettings.max_distance`.
     """
 
     time: FloatArray
     linear: FloatArray
     angular: FloatArray
     place: FloatArray
+    visible: FloatArray
     outcome: NDArray[np.str_]
     approach: FloatArray
     duration: FloatArray
@@ -165,6 +196,25 @@ class Tracing:
     def completed(self) -> bool:
         """Whether the whole rope was traced."""
         return str(self.outcome) == Phase.DONE
+
+
+class ToolErrors(NamedTuple):
+    """Of the tool against the rope as it is.
+
+    Attributes
+    ----------
+    linear, angular : float
+        The paper's errors, metres and rad.
+    place : float
+        Share of the rope's length at which the tool is.
+    visible : float
+        Share of the rope's length that the camera sees.
+    """
+
+    linear: float
+    angular: float
+    place: float
+    visible: float
 
 
 class ClosedLoop:
@@ -258,8 +308,8 @@ class ClosedLoop:
         self._command = control.command.velocity
         return control
 
-    def tool_errors(self) -> tuple[float, float, float]:
-        """Linear and angular error of the tool now, metres and rad, and its place as a share of the length."""
+    def tool_errors(self) -> ToolErrors:
+        """How far the tool is from the rope now."""
         truth = self.simulated.truth()
         tool = inverse_pose(self.simulated.world_from_camera) @ self.moving.world_from_tool()
         turn = tool[:3, :3]
@@ -270,10 +320,11 @@ class ClosedLoop:
         landed = projections(place, truth.polyline)
         link = int(landed.segments[0])
         lengths = np.linalg.norm(np.diff(truth.polyline, axis=0), axis=1)
-        return (
+        return ToolErrors(
             float(linear_errors(place, truth.polyline)[0]),
             float(angular_errors(place, quaternion, truth.polyline, truth.link_quaternions)[0]),
             float((lengths[:link].sum() + landed.fractions[0] * lengths[link]) / lengths.sum()),
+            truth.visible_fraction,
         )
 
 
@@ -300,47 +351,46 @@ def trace(loop: ClosedLoop, on_reading: Callable[[dict[str, float]], None] = lam
     began = loop.time
     tracing_since: float | None = None
     outcome = "too slow"
-    traced = 0.0
     while loop.time - began < settings.longest:
         wish, command = loop.act()
         commands.append(command.velocity)
-        if command.reason is not None and command.reason is not Reason.HOLD:
-            braked[str(command.reason)] = braked.get(str(command.reason), 0) + 1
-        if wish is not None:
-            if wish.phase is Phase.TRACING and tracing_since is None:
-                tracing_since = loop.time
-            if tracing_since is not None:
-                steps += 1
-                limited += bool(np.abs(command.velocity - wish.velocity).max() > 1e-3)
-                traced = max(traced, wish.place / wish.length if wish.length else 0.0)
-                if not wish.phase.ended and round((loop.time - tracing_since) * CONTROL_RATE) % every == 0:
-                    linear, angular, place = loop.tool_errors()
-                    rows.append({"time": loop.time, "linear": linear, "angular": angular, "place": place})
-                    on_reading(rows[-1])
-            q = loop.moving.position
-            jacobian = arm.kinematics(q)[1]
-            least = min(least, manipulability(jacobian))
-            margin = np.minimum(margin, np.minimum(q - arm.limits.lower, arm.limits.upper - q))
-            speed = max(speed, float(np.linalg.norm(jacobian[:3] @ loop.moving.velocity)))
-            if wish.phase.ended:
-                outcome = str(wish.phase)
-                break
+        q = loop.moving.position
+        jacobian = arm.kinematics(q)[1]
+        least = min(least, manipulability(jacobian))
+        margin = np.minimum(margin, np.minimum(q - arm.limits.lower, arm.limits.upper - q))
+        speed = max(speed, float(np.linalg.norm(jacobian[:3] @ loop.moving.velocity)))
+        if wish is not None and wish.phase.ended:
+            outcome = str(wish.phase)
+            break
+        if wish is not None and wish.phase is Phase.TRACING:
+            tracing_since = loop.time if tracing_since is None else tracing_since
+            steps += 1
+            limited += bool(np.abs(command.velocity - wish.velocity).max() > 1e-3)
+        if tracing_since is not None and round((loop.time - tracing_since) * CONTROL_RATE) % every == 0:
+            rows.append({"time": loop.time, **loop.tool_errors()._asdict()})
+            on_reading(rows[-1])
+        braking = "" if command.reason is None else _named(command)
+        if braking:
+            braked[braking] = braked.get(braking, 0) + 1
         if command.reason is Reason.TRACKING:
             outcome = command.text
             break
+        outcome = f"too slow: {braking}" if braking else "too slow"
         loop.see()
-    ended = loop.time
+    end = loop.time
     velocities = np.array(commands)
     accelerations = np.diff(velocities, axis=0, prepend=velocities[:1]) / period
     jerks = np.diff(accelerations, axis=0, prepend=accelerations[:1]) / period
     limits = arm.limits
-    columns = {name: np.array([row[name] for row in rows]) for name in ("time", "linear", "angular", "place")}
-    since = ended if tracing_since is None else tracing_since
+    columns = {name: np.array([row[name] for row in rows]) for name in ("time", *ToolErrors._fields)}
+    since = end if tracing_since is None else tracing_since
+    last = loop.tool_errors()
+    passed = [(errors["place"], errors["linear"]) for errors in rows] + [(last.place, last.linear)] * bool(rows)
     return Tracing(
         **columns,
         outcome=np.array(outcome),
         approach=np.array(since - began),
-        duration=np.array(ended - since),
+        duration=np.array(end - since),
         manipulability=np.array(least),
         margin=margin,
         velocity=np.abs(velocities).max(axis=0) / limits.velocity,
@@ -349,8 +399,13 @@ def trace(loop: ClosedLoop, on_reading: Callable[[dict[str, float]], None] = lam
         tool_speed=np.array(speed),
         limited=np.array(limited / max(steps, 1)),
         braked=np.array(", ".join(f"{count} x {reason}" for reason, count in braked.items())),
-        traced=np.array(traced),
+        traced=np.array(max((at for at, off in passed if off <= settings.tracing.max_distance), default=0.0)),
     )
+
+
+def _named(command: Command) -> str:
+    """Why the guard brakes, without figures: the same words for the same reason."""
+    return command.text.split(":")[0] if command.reason is Reason.HOLD else str(command.reason)
 
 
 def measure_control_time(condition: Condition, settings: Case2Settings) -> float:

@@ -1,92 +1,48 @@
-"""Which cases of case study 1 are run, and the folder in which the finished ones are kept."""
+"""The folder in which the finished cases of an experiment are kept, and the settings they were run with."""
 
 from __future__ import annotations
 
 import io
 import os
+import tomllib
 import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, cast
 
 import numpy as np
 
 from ropetrace.config import read_toml
 from ropetrace.errors import ConfigError, OutputError
-from ropetrace.evaluation.case1 import (
-    CONDITIONS,
-    FREQUENCIES,
-    Case1Settings,
-    Condition,
-    Readings,
-    measure_compute_time,
-    scenario,
-)
+from ropetrace.evaluation.case1 import Case, Condition, measure_compute_time
+from ropetrace.evaluation.experiments import Experiment, Result, Settings
 from ropetrace.results.base import uninterrupted, writing
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """A camera condition and a frequency of the wind, Hz."""
-
-    condition: Condition
-    frequency: float
-
-    @property
-    def name(self) -> str:
-        """Such as 30fps_0.8."""
-        return f"{self.condition.name}_{self.frequency!r}"
-
-
-def choose_cases(
-    settings: Case1Settings,
-    conditions: Sequence[str] = ("30fps", "60fps"),
-    frequencies: Sequence[float] = FREQUENCIES,
-) -> list[Case]:
-    """The cases of some conditions and frequencies, each checked.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such condition, or a frequency or a setting is impossible.
-    """
-    known = {condition.name: condition for condition in CONDITIONS}
-    unknown = [name for name in conditions if name not in known]
-    if unknown:
-        raise ConfigError(f"unknown condition {unknown[0]!r}: choose of {', '.join(known)}")
-    chosen = [known[name] for name in known if name in conditions]
-    cases = [Case(condition, float(frequency)) for condition in chosen for frequency in sorted({*frequencies})]
-    if not cases:
-        raise ConfigError("no case is chosen: give one condition and one frequency at least")
-    for case in cases:
-        planned = scenario(case.condition, case.frequency, settings)
-        planned.camera.camera(settings.seed)
-    return cases
-
-
-class Case1Folder:
+class CaseFolder(Generic[Settings, Result]):
     """Where a run is kept: `settings.toml`, and a file for each case that is finished.
 
     Parameters
     ----------
     path : Path
         The folder; it is made by `begin`.
+    experiment : Experiment
+        Whose cases.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, experiment: Experiment[Settings, Result]) -> None:
         self.path = path
+        self.experiment = experiment
         self._settings_path = path / "settings.toml"
 
-    def begin(
-        self, settings: Case1Settings, conditions: Sequence[Condition], overwrite: bool = False
-    ) -> dict[str, float]:
+    def begin(self, settings: Settings, conditions: Sequence[Condition], overwrite: bool = False) -> dict[str, float]:
         """Begin a run, or go on with one of the same settings.
 
         Parameters
         ----------
-        settings : Case1Settings
+        settings : dataclass
             Of the run.
         conditions : sequence of Condition
             Whose compute time is needed. What was measured before is used again.
@@ -106,17 +62,18 @@ class Case1Folder:
         """
         times = {} if overwrite else self._earlier(settings)
         missing = [condition for condition in conditions if condition.name not in times]
-        times |= {condition.name: measure_compute_time(condition, settings) for condition in missing}
+        shared = self.experiment.shared(settings)
+        times |= {condition.name: measure_compute_time(condition, shared) for condition in missing}
         with writing(self.path):
             (self.path / "cases").mkdir(parents=True, exist_ok=True)
             if overwrite:
                 for file in (self.path / "cases").glob("*.npz"):
                     file.unlink()
         if missing or overwrite:
-            replace_file(self._settings_path, _settings_text(settings, times).encode())
+            replace_file(self._settings_path, self._settings_text(settings, times).encode())
         return times
 
-    def _earlier(self, settings: Case1Settings) -> dict[str, float]:
+    def _earlier(self, settings: Settings) -> dict[str, float]:
         """The compute times of the run that is in the folder; none if there is none."""
         with writing(self.path):
             if self.path.exists() and not self.path.is_dir():
@@ -130,10 +87,10 @@ class Case1Folder:
                 return {}
         table = read_toml(self._settings_path)
         times = table.pop("compute_time", {})
-        now = _settings_table(settings)
-        for name in {**now, **table}:
-            if table.get(name) != now.get(name):
-                was, is_now = (_shown(values.get(name)) for values in (table, now))
+        before, now = _flat(table), _flat(tomllib.loads(_toml(_settings_table(settings))))
+        for name in {**now, **before}:
+            if before.get(name) != now.get(name):
+                was, is_now = (_shown(values.get(name)) for values in (before, now))
                 raise ConfigError(
                     f"{self.path} was begun with other settings ({name}: {was}, now {is_now}): choose another --out, "
                     "or give --overwrite to begin anew"
@@ -142,17 +99,28 @@ class Case1Folder:
             raise ConfigError(f"{self._settings_path}: [compute_time] does not hold seconds: give --overwrite")
         return times
 
+    def _settings_text(self, settings: Settings, times: dict[str, float]) -> str:
+        lines = [
+            f"# Of `ropetrace reproduce {self.experiment.name}`. A run with other settings needs another folder.",
+            _toml(_settings_table(settings)),
+            "",
+            "# From a frame's arrival to its centreline, simulated seconds; measured once, then applied to all.",
+            "[compute_time]",
+            *(f"{name} = {value!r}" for name, value in sorted(times.items())),
+        ]
+        return "\n".join(lines) + "\n"
+
     def case_path(self, case: Case) -> Path:
         """The file of a case."""
         return self.path / "cases" / f"{case.name}.npz"
 
-    def save(self, case: Case, readings: Readings) -> None:
+    def save(self, case: Case, result: Result) -> None:
         """Keep a finished case: the whole file or none."""
         stream = io.BytesIO()
-        np.savez(stream, **asdict(readings))
+        np.savez(stream, **_as_dict(result))
         replace_file(self.case_path(case), stream.getvalue())
 
-    def load(self, case: Case) -> Readings:
+    def load(self, case: Case) -> Result:
         """A finished case.
 
         Raises
@@ -163,7 +131,8 @@ class Case1Folder:
         path = self.case_path(case)
         try:
             with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
-                return Readings(**{item.name: arrays[item.name] for item in fields(Readings)})
+                kind: Any = self.experiment.result
+                return cast(Result, kind(**{item.name: arrays[item.name] for item in fields(kind)}))
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise OutputError(f"{path}: cannot be read ({error}): delete it, and run again") from None
 
@@ -186,21 +155,46 @@ def replace_file(path: Path, data: bytes) -> None:
         os.replace(part, path)
 
 
-def _settings_table(settings: Case1Settings) -> dict[str, Any]:
-    values = {name: value for name, value in asdict(settings).items() if value is not None}
-    return {"version": version("ropetrace"), **values}
+def replace_files(folder: Path, files: dict[str, bytes]) -> list[Path]:
+    """`replace_file` for several, by their names; gives their paths."""
+    for name, data in files.items():
+        replace_file(folder / name, data)
+    return [folder / name for name in files]
 
 
-def _settings_text(settings: Case1Settings, times: dict[str, float]) -> str:
-    lines = ["# Of `ropetrace reproduce case1`. A run with other settings needs another folder."]
-    lines += [f"{name} = {_shown(value)}" for name, value in _settings_table(settings).items()]
-    lines += ["", "# From a frame's arrival to its centreline, simulated seconds; measured once, then applied to all."]
-    lines += ["[compute_time]", *(f"{name} = {value!r}" for name, value in sorted(times.items()))]
-    return "\n".join(lines) + "\n"
+def _settings_table(settings: Any) -> dict[str, Any]:
+    return {"version": version("ropetrace"), **_as_dict(settings)}
+
+
+def _as_dict(item: Any) -> dict[str, Any]:
+    """Of a dataclass."""
+    return asdict(item)
+
+
+def _toml(table: dict[str, Any], name: str = "") -> str:
+    """A table and the tables in it; what is None is left out."""
+    lines = [f"[{name}]"] if name else []
+    inner = []
+    for key, value in table.items():
+        if isinstance(value, dict):
+            inner.append(_toml(value, f"{name}.{key}" if name else key))
+        elif value is not None:
+            lines.append(f"{key} = {_shown(value)}")
+    return "\n\n".join(["\n".join(lines), *inner])
+
+
+def _flat(table: dict[str, Any], start: str = "") -> dict[str, Any]:
+    """The settings of all tables, by names such as tracing.gain_near."""
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        flat |= _flat(value, f"{start}{key}.") if isinstance(value, dict) else {start + key: value}
+    return flat
 
 
 def _shown(value: Any) -> str:
     """As TOML."""
     if value is None:
-        return "measured"
+        return "not set"
+    if isinstance(value, (tuple, list)):
+        return "[" + ", ".join(map(_shown, value)) + "]"
     return f'"{value}"' if isinstance(value, str) else repr(value)

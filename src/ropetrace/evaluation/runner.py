@@ -1,4 +1,4 @@
-"""Runs the cases of case study 1 side by side, and keeps each as soon as it is finished.
+"""Runs the cases of an experiment side by side, and keeps each as soon as it is finished.
 
 The engine is the interface of `concurrent.futures`: on one machine the standard library's process pool serves, which
 needs nothing installed and nothing started, and Dask's scheduler gives the very same interface to a cluster
@@ -21,8 +21,9 @@ from importlib.metadata import version
 from typing import Any
 
 from ropetrace.errors import ConfigError, RopetraceError, import_extra
-from ropetrace.evaluation.case1 import Case1Settings, Condition, Readings, run_case
-from ropetrace.evaluation.case_files import Case, Case1Folder
+from ropetrace.evaluation.case1 import Case
+from ropetrace.evaluation.case_files import CaseFolder
+from ropetrace.evaluation.experiments import Result, Settings
 
 
 def check_engine(jobs: int | None, cluster: str | None) -> None:
@@ -44,9 +45,9 @@ def check_engine(jobs: int | None, cluster: str | None) -> None:
 
 
 def run_cases(
-    folder: Case1Folder,
+    folder: CaseFolder[Settings, Result],
     cases: Sequence[Case],
-    settings: Case1Settings,
+    settings: Settings,
     compute_times: dict[str, float],
     *,
     jobs: int | None = None,
@@ -57,11 +58,11 @@ def run_cases(
 
     Parameters
     ----------
-    folder : Case1Folder
-        Where they are kept; see `Case1Folder.begin`, which also gives `compute_times`.
+    folder : CaseFolder
+        Where they are kept; see `CaseFolder.begin`, which also gives `compute_times`.
     cases : sequence of Case
         What is run.
-    settings : Case1Settings
+    settings : dataclass
         The rest.
     compute_times : dict
         Of each condition, by its name, simulated seconds.
@@ -85,12 +86,14 @@ def run_cases(
     open_cases.sort(key=lambda case: -case.condition.rate * case.condition.width * case.condition.height)
     jobs = min(jobs or len(os.sched_getaffinity(0)), len(open_cases))
     with _process_pool(jobs) if cluster is None else _dask(cluster) as executor:
-        running: dict[Future[Readings], Case] = {}
+        running: dict[Future[Result], Case] = {}
         with _without_interrupt():
             for case in open_cases:
                 seconds = compute_times[case.condition.name]
-                arguments = (case.condition, case.frequency, settings, seconds, version("ropetrace"))
-                running[executor.submit(_run_case, *arguments)] = case
+                future = executor.submit(
+                    _run_case, folder.experiment.run, case, settings, seconds, version("ropetrace")
+                )
+                running[future] = case
         while running:
             done, _ = wait(running, timeout=1, return_when=FIRST_COMPLETED)
             for future in done:
@@ -99,15 +102,15 @@ def run_cases(
 
 
 def _run_case(
-    condition: Condition, frequency: float, settings: Case1Settings, compute_time: float, wanted: str
-) -> Readings:
+    run: Callable[[Case, Settings, float], Result], case: Case, settings: Settings, compute_time: float, wanted: str
+) -> Result:
     """Runs in a worker, perhaps on another machine."""
     if version("ropetrace") != wanted:
         raise ConfigError(f"a worker has ropetrace {version('ropetrace')}, not {wanted}")
-    return run_case(condition, frequency, settings, compute_time)
+    return run(case, settings, compute_time)
 
 
-def _result(future: Future[Readings]) -> Readings:
+def _result(future: Future[Result]) -> Result:
     try:
         return future.result()
     except RopetraceError:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from ropetrace.errors import import_extra
-from ropetrace.evaluation.case1 import CONDITIONS, RESONANCE, Case1Settings, Readings
-from ropetrace.evaluation.case_files import Case, replace_file
+from ropetrace.evaluation.case1 import CONDITIONS, RESONANCE, Case, Case1Settings, Readings
+from ropetrace.evaluation.case_files import replace_files
 from ropetrace.evaluation.sequences import ErrorStatistics
+from ropetrace.evaluation.tables import condition_title, csv_cells, markdown_table, png, spread
 from ropetrace.sim.rope import RopeModel
 from ropetrace.types import FloatArray
 
@@ -81,25 +81,17 @@ def write_report(
         "case1.md": report_text(results, settings, compute_times).encode(),
         "case1.png": figure(results),
     }
-    for name, data in files.items():
-        replace_file(folder / name, data)
-    return [folder / name for name in files]
+    return replace_files(folder, files)
 
 
 def csv_text(results: Results) -> str:
     """A row for each reading; what is missing is empty. Reading a number back gives the same bits."""
     lines = [",".join(["condition", "frequency_hz", *COLUMNS])]
     for case, readings in results.items():
-        columns = [_cells(getattr(readings, name)) for name in COLUMNS.values()]
+        columns = [csv_cells(getattr(readings, name)) for name in COLUMNS.values()]
         start = f"{case.condition.name},{case.frequency!r}"
         lines += [",".join([start, *row]) for row in zip(*columns, strict=True)]
     return "\n".join(lines) + "\n"
-
-
-def _cells(values: Any) -> list[str]:
-    if values.dtype.kind == "U":
-        return list(map(str, values))
-    return ["" if math.isnan(value) else repr(value) for value in values.tolist()]
 
 
 def summary_table(results: Results) -> str:
@@ -118,17 +110,17 @@ def summary_table(results: Results) -> str:
                 f"{case.frequency:g}",
                 str(linear.count),
                 str(linear.missing),
-                _spread(linear.mean * 1e3, linear.std * 1e3),
+                spread(linear.mean * 1e3, linear.std * 1e3),
                 "" if paper is None else "{:g} ± {:g}".format(*paper.linear),
                 f"{linear.p95 * 1e3:.2f}",
                 f"{linear.worst * 1e3:.2f}",
-                _spread(angular.mean * 100, angular.std * 100),
+                spread(angular.mean * 100, angular.std * 100),
                 "" if paper is None else "{:g} ± {:g}".format(*paper.angular),
                 f"{ErrorStatistics.of(readings.symmetric, LINEAR_PENALTY).mean * 1e3:.3f}",
                 f"{readings.coverage.mean():.2%}",
             )
         )
-    return _markdown(header, rows)
+    return markdown_table(header, rows)
 
 
 def _statistics(readings: Readings) -> tuple[ErrorStatistics, ErrorStatistics]:
@@ -137,10 +129,6 @@ def _statistics(readings: Readings) -> tuple[ErrorStatistics, ErrorStatistics]:
         ErrorStatistics.of(readings.linear, LINEAR_PENALTY),
         ErrorStatistics.of(readings.angular, ANGULAR_PENALTY),
     )
-
-
-def _spread(mean: float, std: float) -> str:
-    return f"{mean:.3f} ± {std:.3f}"
 
 
 def _phase(settings: Case1Settings) -> str:
@@ -191,14 +179,14 @@ def _found_alone(results: Results) -> list[str]:
                 case.condition.name,
                 f"{case.frequency:g}",
                 str(len(linear)),
-                _spread(linear.mean() * 1e3, linear.std() * 1e3) if len(linear) else "",
-                _spread(angular.mean() * 100, angular.std() * 100) if len(angular) else "",
+                spread(linear.mean() * 1e3, linear.std() * 1e3) if len(linear) else "",
+                spread(angular.mean() * 100, angular.std() * 100) if len(angular) else "",
             )
         )
     if not rows:
         return []
     header = ("camera", "wind, Hz", "found", "linear, mm", "angular, 0.01 rad")
-    return ["Where readings are missing, those that were found, alone:", _markdown(header, rows)]
+    return ["Where readings are missing, those that were found, alone:", markdown_table(header, rows)]
 
 
 def _mean_errors(results: Results) -> list[str]:
@@ -210,7 +198,10 @@ def _mean_errors(results: Results) -> list[str]:
             rows.append(
                 (condition.name, str(len(means)), f"{np.mean(means) * 1e3:.3f}", f"{PAPER_MEANS[condition.name]:.2f}")
             )
-    return ["Mean linear error over the cases, mm:", _markdown(("camera", "cases", "ours", "paper (9 cases)"), rows)]
+    return [
+        "Mean linear error over the cases, mm:",
+        markdown_table(("camera", "cases", "ours", "paper (9 cases)"), rows),
+    ]
 
 
 def _resonance(results: Results) -> list[str]:
@@ -255,7 +246,7 @@ def _resonance(results: Results) -> list[str]:
         "spline's part is what a spline through the true joints shows against the straight links; the sensor's is the "
         "difference to a run without noise. The rest is what the total has more or less than moved and own: errors "
         "that point different ways do not add up.",
-        _markdown(
+        markdown_table(
             (
                 "camera",
                 "age, ms",
@@ -271,16 +262,8 @@ def _resonance(results: Results) -> list[str]:
         ),
         "The angle, in 0.01 rad. The floor is owed to the truth, whose ten links are straight: it is the error of a "
         "perfect curve, a spline through the true joints.",
-        _markdown(("camera", "floor", "own beyond it", "age", "angular"), angular_rows),
+        markdown_table(("camera", "floor", "own beyond it", "age", "angular"), angular_rows),
     ]
-
-
-def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table whose columns also line up where it is not rendered."""
-    widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
-    lines = [" | ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in [header, *rows]]
-    lines.insert(1, " | ".join("-" * (width - 1) + ":" for width in widths))
-    return "\n".join(f"| {line} |" for line in lines)
 
 
 def figure(results: Results) -> bytes:
@@ -311,14 +294,8 @@ def figure(results: Results) -> bytes:
             axis.spines[["top", "right"]].set_visible(False)
             if column == 0:
                 axis.set_ylabel(f"{kind} error, {label}")
-        axes[0, column].set_title(
-            f"({'ab'[column]}) {condition.rate:g} fps, {condition.width}x{condition.height}, "
-            + ("real time" if condition.speed == 1 else f"{condition.speed:.0%} of real time"),
-            fontsize=10,
-        )
+        axes[0, column].set_title(f"({'ab'[column]}) {condition_title(condition)}", fontsize=10)
         axes[1, column].set_xlabel("frequency of the wind, Hz")
         axes[1, column].xaxis.set_major_locator(MultipleLocator(0.2))
     axes[0, 0].legend(frameon=False, loc="upper left", title="mean ± standard deviation", alignment="left")
-    stream = io.BytesIO()
-    sheet.savefig(stream, format="png", metadata={"Software": None})
-    return stream.getvalue()
+    return png(sheet)
