@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ropetrace.control.arm import Arm
-from ropetrace.control.limits import Command, GuardOptions, MotionGuard, ToolLimits
+from ropetrace.control.limits import Command, GuardOptions, MotionGuard, ToolLimits, finite_number
 from ropetrace.control.tracing import RopeTracer, Step, TracingSettings
 from ropetrace.motion import MotionEstimator
-from ropetrace.types import Estimate, FloatArray, Status, moved
+from ropetrace.types import Estimate, FloatArray, Motion, Status, moved
 
 LOST_AFTER = 3
 """Frames in a row without the rope after which the arm is told to stop; a trajectory that gets too old stops it too."""
+
+UNKNOWN = "the rope's motion is not known"
+"""Reason of a hold until there are two frames, and after one that does not fit those before."""
 
 
 class Control(NamedTuple):
@@ -23,7 +26,7 @@ class Control(NamedTuple):
     Attributes
     ----------
     step : Step or None
-        What the tracer wanted; None where nothing is known of the rope's motion.
+        What the tracer wanted; None where it was not asked: the rope's motion or the arm's position is not known.
     command : Command
         What the joints are told.
     """
@@ -50,9 +53,16 @@ class TracingController:
     settings : TracingSettings
         Of the tracer.
     guard_options : GuardOptions
-        Of the guard.
+        Of the guard. Its `max_age` is from the stamp of the newest frame to the end of the last command that rests on
+        it: the guard itself is given a period less.
     tool_limits : ToolLimits, optional
-        By default 1.7 m/s, 2.5 rad/s and no walls.
+        By default 1.7 m/s, 2.5 rad/s and no walls. They make the joints' velocities shorter as a whole: where the tool
+        turns too fast, it also slows down along the rope.
+
+    Raises
+    ------
+    ConfigError
+        If an option is impossible, or `max_age` is not longer than a period.
     """
 
     def __init__(
@@ -68,23 +78,24 @@ class TracingController:
     ) -> None:
         self.arm = arm
         self.tracer = RopeTracer(arm, settings or TracingSettings(), base_from_camera[:3, 2])
-        self.guard = MotionGuard(arm.limits, position, period, guard_options)
+        options = guard_options or GuardOptions()
+        self.guard = MotionGuard(arm.limits, position, period, replace(options, max_age=options.max_age - period))
         self.tool_limits = tool_limits or ToolLimits(period=period)
-        self._base_from_camera = base_from_camera
+        self._base_from_camera = np.array(base_from_camera, float)
         self._motion = motion
         self._stamp: float | None = None
         self._lost = 0
 
     def see(self, estimate: Estimate) -> None:
         """Take an estimate of the tracker, camera frame, as soon as there is one."""
-        if estimate.status is Status.LOST:
+        if estimate.status is Status.LOST or not np.isfinite(estimate.waypoints.positions).all():
             self._lost += 1
             return
         self._lost = 0
         self._stamp = estimate.stamp_ns * 1e-9
         self._motion.update(estimate.stamp_ns, estimate.waypoints)
 
-    def act(self, now: float, q: FloatArray) -> Control:
+    def act(self, now: Any, q: Any) -> Control:
         """One control step.
 
         Parameters
@@ -99,13 +110,26 @@ class TracingController:
         Control
             A command whatever comes in: where something is wrong it brakes, and says why.
         """
-        age = math.inf if self._stamp is None else now - self._stamp
-        usable = age + self.guard.options.max_future >= 0 and age <= self.guard.options.max_age
-        prediction = self._motion.predict(max(age, 0.0)) if usable else None
-        if prediction is None or not self._sound(q):
-            hold = "the rope's motion is not known" if self._stamp is None or usable else None
-            return Control(None, self.guard.step(now, q, None, now if self._stamp is None else self._stamp, hold))
-        positions, motion = prediction
+        stamp, joints, time = self._stamp, self.guard.believable(q), finite_number(now)
+        if stamp is None or time is None or joints is None:
+            # A bad time or position is a graver reason to the guard.
+            return Control(None, self.guard.step(now, q, None, now if stamp is None else stamp, UNKNOWN))
+        options = self.guard.options
+        if not -options.max_future <= time - stamp <= options.max_age:
+            return Control(None, self.guard.step(now, q, None, stamp))
+        prediction = self._motion.predict(max(time - stamp, 0.0))
+        if prediction is None:
+            return Control(None, self.guard.step(now, q, None, stamp, UNKNOWN))
+        # What overflows becomes no wish, at which the guard brakes.
+        with np.errstate(all="ignore"):
+            step, wish = self._wish(time, joints, *prediction)
+        hold = str(step.phase) if step.phase.ended else None
+        if self._lost >= LOST_AFTER:
+            hold = f"the rope is lost: {self._lost} frames without it"
+        return Control(step, self.guard.step(now, q, wish, stamp, hold))
+
+    def _wish(self, now: float, q: FloatArray, positions: FloatArray, motion: Motion) -> tuple[Step, FloatArray]:
+        """What the tracer wants, and as much of it as the tool and each joint can do."""
         turn = self._base_from_camera[:3, :3].T
         step = self.tracer.step(
             now,
@@ -114,17 +138,9 @@ class TracingController:
             motion.velocities @ turn,
             motion.accelerations @ turn,
         )
-        hold = str(step.phase) if step.phase.ended else None
-        if self._lost >= LOST_AFTER:
-            hold = f"the rope is lost: {self._lost} frames without it"
         pose, jacobian = self.arm.kinematics(q)
         wish = self.tool_limits.scale(jacobian, pose[:3, 3], step.velocity)
         if np.isfinite(wish).all():
             # Joint by joint: the guard would slow all of them down to the pace of the slowest.
             wish = np.clip(wish, *self.guard.velocity_bounds(q))
-        assert self._stamp is not None
-        return Control(step, self.guard.step(now, q, wish, self._stamp, hold))
-
-    def _sound(self, q: FloatArray) -> bool:
-        values = np.asarray(q)
-        return values.shape == (self.arm.count,) and values.dtype.kind in "fiu" and bool(np.isfinite(values).all())
+        return step, wish

@@ -232,6 +232,13 @@ class MotionGuard:
         self._last: float | None = None
         self._rest = 0
 
+    def believable(self, measured: Any) -> FloatArray | None:
+        """The measured position as an array, (n,), rad; None where `step` brakes at it, whatever else it is given."""
+        where = self._vector("", measured)[0]
+        if where is None or not np.abs(where - self._state[0]).max() <= self.options.max_tracking_error:
+            return None
+        return where
+
     def velocity_bounds(self, measured: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
         """What each joint can do in the next step.
 
@@ -295,7 +302,7 @@ class MotionGuard:
         self, now: float, where: FloatArray | None, wrong: str, vain: str, stamp: float, hold: str | None
     ) -> tuple[Reason | None, str]:
         """Why to brake: the gravest reason."""
-        time, last = _number(now), self._last
+        time, last = finite_number(now), self._last
         if time is not None:
             self._last = time
         if where is not None and not self._fault:
@@ -319,7 +326,7 @@ class MotionGuard:
             return Reason.INPUT, wrong
         if hold is not None:
             return Reason.HOLD, str(hold)
-        made = _number(stamp)
+        made = finite_number(stamp)
         if made is None:
             return Reason.INPUT, f"the stamp is {stamp!r}, not a finite number of seconds"
         if not -self.options.max_future <= time - made <= self.options.max_age:
@@ -422,7 +429,7 @@ class ToolLimits:
         return wish * share if math.isfinite(share) else np.full(wish.shape, np.nan)
 
 
-def _number(value: Any) -> float | None:
+def finite_number(value: Any) -> float | None:
     """A finite number, else None."""
     try:
         number = float(value) if np.ndim(value) == 0 else math.nan

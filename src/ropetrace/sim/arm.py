@@ -49,8 +49,15 @@ class ArmSimulation:
         start = np.asarray(position, float)
         if start.shape != (arm.count,) or not np.isfinite(start).all():
             raise ConfigError(f"the arm {arm.name} has {arm.count} joints: a position of {start} is none of it")
+        outside = np.flatnonzero((start < arm.limits.lower) | (start > arm.limits.upper))
+        if len(outside):
+            joint = outside[0]
+            raise ConfigError(
+                f"the arm {arm.name} cannot start with joint {joint + 1} at {start[joint]:g} rad: its range is "
+                f"{arm.limits.lower[joint]:g} to {arm.limits.upper[joint]:g} rad"
+            )
         self.arm = arm
-        self.world_from_base = world_from_base
+        self.world_from_base = np.array(world_from_base, float)
         self._mujoco = mujoco
         try:
             spec = mujoco.MjSpec.from_file(str(arm.path))
@@ -102,8 +109,24 @@ class ArmSimulation:
         return np.array(self._data.qvel[self._dofs])
 
     def advance(self, time: float, velocity: FloatArray) -> None:
-        """Go on to a time, to the nearest step, with a command that is held: (n,), rad/s."""
-        self._data.ctrl[:] = np.repeat(velocity, 2)
+        """Go on to a time, to the nearest step, with a command that is held.
+
+        Parameters
+        ----------
+        time : float
+            Seconds since the start. One that is past changes nothing.
+        velocity : (n,) float array
+            Of the joints, rad/s.
+
+        Raises
+        ------
+        ValueError
+            If the velocity is not n finite numbers.
+        """
+        command = np.asarray(velocity, float)
+        if command.shape != (self.arm.count,) or not np.isfinite(command).all():
+            raise ValueError(f"velocity = {velocity}: expected {self.arm.count} finite numbers, rad/s")
+        self._data.ctrl[:] = np.repeat(command, 2)
         for _ in range(self._step, round(time / ARM_TIMESTEP)):
             self._mujoco.mj_step(self._physics, self._data)
             self._step += 1
