@@ -194,7 +194,7 @@ class Spoilt(KnownMotion):
 
     def __init__(self, loop: Loop, bad: float, where: int) -> None:
         super().__init__(loop.rope, loop.camera_from_base)
-        self.stamp = loop.controller._stamp
+        self.stamp_ns = loop.controller._motion.stamp_ns
         self.bad, self.where = bad, where
 
     def predict(self, ahead: float) -> Any:

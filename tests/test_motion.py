@@ -454,7 +454,7 @@ def test_a_curve_without_length_is_none(count: int) -> None:
     assert estimator.update(0, nothing) is None
     found = [error for *_, error in feed(estimator, swing, frames[:20])]
     assert estimator.update(stamp(20 * DT), nothing) is None
-    assert estimator.predict(0.04) is None
+    assert estimator.stamp_ns == stamp(19 * DT)
     found = [error for *_, error in feed(estimator, swing, frames[21:])]
     assert max(found) < 0.08
 
@@ -487,7 +487,8 @@ def test_whatever_comes_the_motion_is_finite(shapes: list[list[tuple[float, floa
         motion = estimator.update(now, Waypoints(positions, np.tile([0.0, 0, 0, 1], (len(positions), 1)), lengths))
         for ahead in (0.0, 0.1):
             prediction = estimator.predict(ahead)
-            assert (prediction is None) == (motion is None)
+            assert (prediction is None) == (estimator.stamp_ns is None)
+            assert motion is None or estimator.stamp_ns == now
             if prediction is not None:
                 moved, moving = prediction
                 for array in (moved, moving.velocities, moving.accelerations):
@@ -569,6 +570,24 @@ def test_predictions_are_as_good_as_they_say(ahead: float) -> None:
     assert 0.3 < np.mean(scores) < 1.5
     predicted, unpredicted = np.mean(better, axis=0)
     assert predicted < unpredicted / 3
+
+
+def test_a_frame_that_does_not_fit_leaves_the_prediction_as_it_was() -> None:
+    estimator, frames = ArcLengthMotion(D), film(swing, 30)
+    for frame in frames[:20]:
+        estimator.update(stamp(frame.time), frame.waypoints)
+    before = estimator.predict(0.05)
+    wrong = frames[20].waypoints
+    shifted = Waypoints(wrong.positions + [0.4, 0.0, 0.0], wrong.quaternions, wrong.arc_length)
+    assert estimator.update(stamp(frames[20].time), shifted) is None
+    assert estimator.stamp_ns == stamp(frames[19].time)
+    after = estimator.predict(0.05)
+    assert before is not None
+    assert after is not None
+    np.testing.assert_array_equal(after[0], before[0])
+    np.testing.assert_array_equal(after[1].position_sigma, before[1].position_sigma)
+    assert estimator.update(stamp(frames[21].time), frames[21].waypoints) is not None
+    assert estimator.stamp_ns == stamp(frames[21].time)
 
 
 def test_there_is_no_prediction_before_motion_is_known_and_none_after_a_reset() -> None:

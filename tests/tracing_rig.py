@@ -77,23 +77,23 @@ class KnownMotion:
 
     def __init__(self, rope: Rope, camera_from_base: FloatArray) -> None:
         self.rope, self.camera_from_base = rope, camera_from_base
-        self.stamp: float | None = None
+        self.stamp_ns: int | None = None
 
     def update(self, stamp_ns: int, waypoints: Waypoints) -> Motion | None:
-        self.stamp = stamp_ns * 1e-9
+        self.stamp_ns = stamp_ns
         return None
 
     def predict(self, ahead: float) -> tuple[FloatArray, Motion] | None:
-        if self.stamp is None:
+        if self.stamp_ns is None:
             return None
-        time, turn = self.stamp + ahead, self.camera_from_base[:3, :3].T
+        time, turn = self.stamp_ns * 1e-9 + ahead, self.camera_from_base[:3, :3].T
         positions = moved(self.rope(time), self.camera_from_base)
         none = np.zeros_like(positions)
         velocity, acceleration = velocities(self.rope, time) @ turn, accelerations(self.rope, time) @ turn
         return positions, Motion(velocity, acceleration, none, none, none)
 
     def reset(self) -> None:
-        self.stamp = None
+        self.stamp_ns = None
 
 
 class Loop:

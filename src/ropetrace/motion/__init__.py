@@ -17,6 +17,10 @@ from ropetrace.types import FloatArray, Motion, Waypoints
 class MotionEstimator(Protocol):
     """Follows the waypoints of one rope from frame to frame."""
 
+    @property
+    def stamp_ns(self) -> int | None:
+        """Of the frame that predictions start from, nanoseconds: the last one that gave a motion; None without one."""
+
     def update(self, stamp_ns: int, waypoints: Waypoints) -> Motion | None:
         """Take the waypoints of a frame.
 
@@ -42,12 +46,12 @@ class MotionEstimator(Protocol):
         """
 
     def predict(self, ahead: float) -> tuple[FloatArray, Motion] | None:
-        """Where the waypoints of the last update are at a later time.
+        """Where the waypoints of the last frame that gave a motion are at a later time.
 
         Parameters
         ----------
         ahead : float
-            Seconds after the stamp of the last update.
+            Seconds after that frame's stamp, `stamp_ns`.
 
         Returns
         -------
@@ -56,7 +60,7 @@ class MotionEstimator(Protocol):
         motion : Motion
             At that time.
 
-        Or None where the last update gave none.
+        Or None while there is none.
         """
 
     def reset(self) -> None:

@@ -71,12 +71,16 @@ class ArcLengthMotion:
         """Forget the frames so far."""
         self._stamp_ns: int | None = None
         self._missed = 0
-        self._known = False
+        self._known_ns: int | None = None
         self._count = 0.0
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """Of the frame that `predict` starts from."""
+        return self._known_ns
 
     def update(self, stamp_ns: int, waypoints: Waypoints) -> Motion | None:
         """Take the waypoints of a frame; see `motion.MotionEstimator.update`."""
-        self._known = False
         if not np.isfinite(waypoints.positions).all():
             raise ValueError("waypoints: a coordinate is not a finite number")
         if waypoints.length <= 0:
@@ -103,14 +107,14 @@ class ArcLengthMotion:
         filters.mixture(self._states, self._spreads, self._noise, self._weights, self._means, self._covariances)
         self._unseen[self._measured] = 0.0
         self._waypoints = waypoints
-        self._known = True
+        self._known_ns = stamp_ns
         self._fit_grid()
         self._smooth_fields()
         return self._at_waypoints(0.0)[1]
 
     def predict(self, ahead: float) -> tuple[FloatArray, Motion] | None:
         """Where the waypoints of the last update are `ahead` seconds later; see `motion.MotionEstimator.predict`."""
-        if not self._known:
+        if self._known_ns is None:
             return None
         return self._at_waypoints(ahead)
 
@@ -118,6 +122,7 @@ class ArcLengthMotion:
         length = waypoints.length
         count = int(np.clip(round(length / (SPACING * self._diameter)) + 1, FEWEST_POINTS, MOST_POINTS))
         self._stamp_ns = stamp_ns
+        self._known_ns = None
         self._missed = 0
         self._arcs = np.linspace(0.0, length, count)
         self._extent = (0.0, length)
@@ -185,6 +190,8 @@ class ArcLengthMotion:
         places = np.ascontiguousarray(self._means[:, 0])
         make_inextensible(places, self._velocities, self._accelerations, self._measured)
         filters.jerk_density(self._noise, self._weights, self._density)
+        # The next frame may not fit: what is predicted until then rests on this one.
+        self._settled = self._covariances.copy()
 
     def _at_waypoints(self, ahead: float) -> tuple[FloatArray, Motion]:
         waypoints = self._waypoints
@@ -197,7 +204,7 @@ class ArcLengthMotion:
             self._arcs,
             self._velocities,
             self._accelerations,
-            self._covariances,
+            self._settled,
             self._density,
             ahead,
             values,

@@ -49,9 +49,13 @@ class ClosestMotion:
         self._variances = np.zeros(2)
         self._updates = 0
 
+    @property
+    def stamp_ns(self) -> int | None:
+        """Of the frame that `predict` starts from."""
+        return None if self._motion is None else self._stamp_ns
+
     def update(self, stamp_ns: int, waypoints: Waypoints) -> Motion | None:
         """Take the waypoints of a frame; see `motion.MotionEstimator.update`."""
-        self._motion = None
         if not np.isfinite(waypoints.positions).all():
             raise ValueError("waypoints: a coordinate is not a finite number")
         if not len(waypoints):
