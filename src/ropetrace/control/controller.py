@@ -95,7 +95,7 @@ class TracingController:
         self._motion.update(estimate.stamp_ns, estimate.waypoints)
         known = self._motion.stamp_ns
         # A frame that does not fit is passed over: for as long as they are fresh, the ones before it serve.
-        self._stamp = None if known is None else known * 1e-9
+        self._stamp = (estimate.stamp_ns if known is None else known) * 1e-9
 
     def act(self, now: Any, q: Any) -> Control:
         """One control step.
