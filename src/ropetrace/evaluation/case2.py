@@ -29,12 +29,13 @@ from ropetrace.evaluation.case1 import Case1Settings, Condition, rope_config, sc
 from ropetrace.evaluation.metrics import projections
 from ropetrace.evaluation.paper_errors import angular_errors, linear_errors
 from ropetrace.motion import make_motion
+from ropetrace.self_filter import without_robot
 from ropetrace.sim.arm import RESPONSE, ArmSimulation
 from ropetrace.sim.rope import TIMESTEP
 from ropetrace.sim.scenario import SimulatedScene
 from ropetrace.sim.scene import inverse_pose
 from ropetrace.trackers import make_tracker
-from ropetrace.types import Estimate, FloatArray
+from ropetrace.types import Estimate, FloatArray, RgbdFrame
 
 CONTROL_RATE = 240.0
 """Control steps a second: a whole number of steps of the simulation."""
@@ -93,6 +94,8 @@ class Case2Settings:
     """A tracing that takes longer has failed, seconds."""
     noise: str = "none"
     method: str = "slicing"
+    self_filter: bool = True
+    """Take the arm out of the image before tracking; a noisy sensor's depth bleeds from the hand into the rope."""
     latency: float | None = None
     """From the arrival of a frame to its centreline, seconds; None is measured."""
     seed: int = 0
@@ -294,6 +297,8 @@ class ClosedLoop:
             index, available = self._schedule.popleft()
             self.simulated.robot = self.moving.capsules()
             frame = self.simulated.camera.expose(self.simulated.scene_at, self._stamps[index], self._first + index)
+            if self.settings.self_filter:
+                frame = self._without_arm(frame)
             estimate = self.tracker.update(frame)
             self._waiting.append((available, estimate))
             if self.on_frame is not None:
@@ -301,6 +306,11 @@ class ClosedLoop:
         self.simulated.rope.advance(now)
         while self._waiting and self._waiting[0][0] <= now + 1e-9:
             self.controller.see(self._waiting.popleft()[1])
+
+    def _without_arm(self, frame: RgbdFrame) -> RgbdFrame:
+        """What the tracker is given, if the arm is taken out of the image by where its joints say that it is."""
+        arm = self.simulated.robot.transformed(inverse_pose(self.simulated.world_from_camera))
+        return without_robot(frame, arm.starts, arm.ends, arm.radii)
 
     def act(self) -> Control:
         """One control step; its command holds until the next."""
