@@ -197,4 +197,6 @@ def _shown(value: Any) -> str:
         return "not set"
     if isinstance(value, (tuple, list)):
         return "[" + ", ".join(map(_shown, value)) + "]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
     return f'"{value}"' if isinstance(value, str) else repr(value)
