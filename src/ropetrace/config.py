@@ -23,6 +23,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
+from ropetrace.config_methods import CdcpdConfig, CpdConfig, GltpConfig, SprConfig, TrackDloConfig
 from ropetrace.errors import ConfigError
 from ropetrace.types import FloatArray
 
@@ -262,6 +263,11 @@ class RopeConfig:
     ordering: OrderingConfig = field(default_factory=OrderingConfig)
     centerline: CenterlineConfig = field(default_factory=CenterlineConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
+    cpd: CpdConfig = field(default_factory=CpdConfig)
+    gltp: GltpConfig = field(default_factory=GltpConfig)
+    spr: SprConfig = field(default_factory=SprConfig)
+    trackdlo: TrackDloConfig = field(default_factory=TrackDloConfig)
+    cdcpd: CdcpdConfig = field(default_factory=CdcpdConfig)
 
     def __post_init__(self) -> None:
         low, high = DIAMETER_RANGE
@@ -347,12 +353,15 @@ class RopeConfig:
             raise ConfigError(f"{path}: {error}") from None
 
     def to_toml(self) -> str:
-        """The settings as TOML; what is None is left out."""
+        """The settings as TOML; what is None is left out, and so are defaults of methods other than `method`."""
         top: list[str] = []
         tables: list[str] = []
         for item in dataclasses.fields(self):
             value = getattr(self, item.name)
             if dataclasses.is_dataclass(value):
+                default = _METHOD_TABLES.get(item.name)
+                if default is not None and item.name != self.method and value == default():
+                    continue
                 rows = [
                     f"{inner.name} = {_toml_value(getattr(value, inner.name))}"
                     for inner in dataclasses.fields(value)
@@ -362,6 +371,16 @@ class RopeConfig:
             elif value is not None:
                 top.append(f"{item.name} = {_toml_value(value)}")
         return "\n\n".join(["\n".join(top), *tables]) + "\n"
+
+
+_METHOD_TABLES: dict[str, type[Any]] = {
+    "cpd": CpdConfig,
+    "gltp": GltpConfig,
+    "spr": SprConfig,
+    "trackdlo": TrackDloConfig,
+    "cdcpd": CdcpdConfig,
+}
+"""Tables that matter to one method only, and have its name."""
 
 
 def default_variance_threshold(diameter: float) -> float:

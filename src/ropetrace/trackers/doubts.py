@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from ropetrace.trackers.clouds import closest_places
 from ropetrace.types import FloatArray
 
 TOO_THIN, TOO_WIDE = 0.6, 1.5
@@ -137,7 +138,7 @@ def _strands_overlap(chain: Any, diameter: float) -> bool:
         gone = False
         for j in range(i + 2, count - 1):
             near = min(ranges[i], ranges[i + 1], ranges[j], ranges[j + 1])
-            apart = _segment_distance(views[i], views[i + 1], views[j], views[j + 1]) * near
+            apart = closest_places(views[i], views[i + 1], views[j], views[j + 1])[2] * near
             # A rope that leads away from the camera stays close to itself in the view without overlapping.
             if gone and apart < _OVERLAP * diameter:
                 return True
@@ -157,26 +158,3 @@ def _sharpest_turn(chain: Any) -> float:
             product += u * v
         least = min(least, product / max(np.sqrt(before * after), 1e-300))
     return np.arccos(max(least, -1.0))
-
-
-@njit(cache=True, nogil=True)
-def _segment_distance(a: Any, b: Any, c: Any, d: Any) -> float:
-    """Least distance of two stretches ab and cd in space (Ericson, Real-Time Collision Detection, 2005, 5.1.9)."""
-    uu = vv = uv = uw = vw = 0.0
-    for k in range(3):
-        u, v, w = b[k] - a[k], d[k] - c[k], a[k] - c[k]
-        uu += u * u
-        vv += v * v
-        uv += u * v
-        uw += u * w
-        vw += v * w
-    across = uu * vv - uv * uv
-    s = min(max((uv * vw - uw * vv) / across, 0.0), 1.0) if across > 1e-12 * uu * vv else 0.0
-    t = (uv * s + vw) / vv if vv > 0 else 0.0
-    if t < 0.0 or t > 1.0 or vv == 0.0:
-        t = min(max(t, 0.0), 1.0)
-        s = min(max((uv * t - uw) / uu, 0.0), 1.0) if uu > 0 else 0.0
-    total = 0.0
-    for k in range(3):
-        total += (a[k] + s * (b[k] - a[k]) - c[k] - t * (d[k] - c[k])) ** 2
-    return np.sqrt(total)

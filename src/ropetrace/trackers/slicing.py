@@ -91,7 +91,24 @@ class SlicingTracker:
             return Estimate.lost(frame.stamp_ns, "no points of the rope's colour and place")
         if stride > 1:
             reasons.append(f"{count} points passed, one in {stride} is used: narrow the colour or the position box")
+        return self.estimate(frame.stamp_ns, points, count, stride, reasons, lap)
 
+    def estimate(
+        self, stamp_ns: int, points: FloatArray, count: int, stride: int, reasons: list[str], lap: Lap = no_lap
+    ) -> Estimate:
+        """What `update` makes of the points that `rope_points` gave, and of the reasons to doubt them.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Of the frame, nanoseconds.
+        points, count, stride
+            As `rope_points` gave them; the points, (3, N), are sorted in place.
+        reasons : list of str
+            What is doubtful so far.
+        lap : callable
+            Told of the end of each stage.
+        """
         slices = self._slicer.slice(points)
         lap("slicing")
         if slices.capped:
@@ -99,14 +116,14 @@ class SlicingTracker:
                 f"more than {self._slicer.max_nodes} slices: background is taken for rope, or the diameter is too small"
             )
         if len(slices) < 2:
-            return Estimate.lost(frame.stamp_ns, _too_little(points.shape[1], len(slices)), count)
+            return Estimate.lost(stamp_ns, _too_little(points.shape[1], len(slices)), count)
 
         slices, trouble = self._in_order(slices)
         reasons += trouble
         lap("ordering")
         slices = slices.kept(_distinct(slices.centroids))
         if len(slices) < 2:
-            return Estimate.lost(frame.stamp_ns, _scattered(points.shape[1]), count)
+            return Estimate.lost(stamp_ns, _scattered(points.shape[1]), count)
 
         tangents = chain_tangents(slices.centroids)
         nodes, widths = axis_points(points, slices, tangents, self.config.radius, self.config.slicing.surface_offset)
@@ -120,7 +137,7 @@ class SlicingTracker:
         reasons += self._doubts.of_length(waypoints.length, sound=not reasons)
         self._slices, self._chain, self._waypoints = slices, slices.centroids, waypoints
         status = Status.DEGRADED if reasons else Status.OK
-        return Estimate(frame.stamp_ns, status, tuple(reasons), nodes, waypoints, count, stride)
+        return Estimate(stamp_ns, status, tuple(reasons), nodes, waypoints, count, stride)
 
     def cloud(self) -> Cloud:
         """The points of the last frame and their nodes: a copy."""
