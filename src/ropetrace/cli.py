@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, arg
 
+from ropetrace.cli_compare import Compare
 from ropetrace.cli_simulation import Reproduce, Simulate, parse_duration
 from ropetrace.cli_trace import Trace
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
@@ -263,6 +264,7 @@ def main() -> None:
         | Annotated[Doctor, tyro.conf.subcommand("doctor")]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
         | Annotated[Trace, tyro.conf.subcommand("trace")]
+        | Annotated[Compare, tyro.conf.subcommand("compare")]
         | Annotated[Reproduce, tyro.conf.subcommand("reproduce")],  # type: ignore[arg-type]
         prog="ropetrace",
         description="The 3-D shape of a rope, cable or hose from the recordings of an RGB-D camera. "

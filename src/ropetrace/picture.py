@@ -37,28 +37,31 @@ def overlay(frame: Frame, estimate: Estimate, cloud: Cloud | None = None, title:
 
     Depth is shown where the frame has no colour. A point cloud is shown as its camera would see it.
     """
-    if isinstance(frame, RgbdFrame):
-        camera = frame.intrinsics
-        # Colour is dimmed so that the drawing stands out of it.
-        base = depth_image(frame) if frame.color is None else (frame.color * 0.7).astype(np.uint8)
-        picture = Image.fromarray(base)
-    else:
-        camera = _camera_around(frame, cloud)
-        picture = Image.fromarray(_splat(frame, camera))
+    picture, camera = backdrop(frame, cloud)
     zoom = TILE_WIDTH / picture.width
     said = f"{estimate.status}  {estimate.waypoints.length:.3f} m  {len(estimate.nodes)} nodes"
     if estimate.reasons:
         said += f"\n{estimate.reasons[0][:90]}"
     picture = captioned(picture, title, said, _STATUS_COLORS[estimate.status])
     draw = ImageDraw.Draw(picture)
-    line = _pixels(estimate.waypoints.positions, camera) * zoom
+    line = pixels_of(estimate.waypoints.positions, camera) * zoom
     if len(line) > 1:
         draw.line([tuple(pixel) for pixel in line.tolist()], fill=_LINE, width=2)
-        for u, v in _pixels(estimate.nodes, camera) * zoom:
+        for u, v in pixels_of(estimate.nodes, camera) * zoom:
             draw.ellipse((u - 2, v - 2, u + 2, v + 2), fill=_NODE)
         u, v = line[0]
         draw.ellipse((u - 6, v - 6, u + 6, v + 6), outline=_START, width=2)
     return picture
+
+
+def backdrop(frame: Frame, cloud: Cloud | None = None) -> tuple[Image.Image, Intrinsics]:
+    """The frame's image to draw on, and the camera that sees it: for a point cloud, one that looks at the rope."""
+    if isinstance(frame, RgbdFrame):
+        # Colour is dimmed so that the drawing stands out of it.
+        base = depth_image(frame) if frame.color is None else (frame.color * 0.7).astype(np.uint8)
+        return Image.fromarray(base), frame.intrinsics
+    camera = _camera_around(frame, cloud)
+    return Image.fromarray(_splat(frame, camera)), camera
 
 
 def captioned(
@@ -133,7 +136,7 @@ class ContactSheet:
         return True
 
 
-def _pixels(points: FloatArray, camera: Intrinsics) -> FloatArray:
+def pixels_of(points: FloatArray, camera: Intrinsics) -> FloatArray:
     """Projections of (N, 3) points: columns and rows, (N, 2). Points behind the camera are left out."""
     points = points[points[:, 2] > 1e-6]
     return np.stack(
@@ -164,7 +167,7 @@ def _splat(frame: CloudFrame, camera: Intrinsics) -> NDArray[np.uint8]:
     image = np.full((camera.height, camera.width, 3), 15, np.uint8)
     finite = np.isfinite(frame.points).all(axis=1) & (frame.points[:, 2] > 1e-6)
     points = frame.points[finite].astype(float)
-    columns, rows = np.round(_pixels(points, camera)).astype(int).T
+    columns, rows = np.round(pixels_of(points, camera)).astype(int).T
     inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
     image[rows[inside], columns[inside]] = 120 if frame.colors is None else frame.colors[finite][inside]
     return image

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ropetrace.errors import ConfigError
-from ropetrace.sim.pixel_random import keys, uniform
+from ropetrace.sim.pixel_random import NORMAL_QUANTILES, keys, normal, uniform
 from ropetrace.sim.raycaster import Window, grown
 from ropetrace.sim.triangulation import KinectV1, Stereo
 from ropetrace.types import Intrinsics
@@ -207,6 +207,31 @@ class FlyingPixels:
         return out
 
 
+@dataclass(frozen=True, slots=True)
+class WhiteNoise:
+    """Normal noise along the ray's depth, of one deviation everywhere: no sensor's, but comparable between papers.
+
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation, metres.
+    """
+
+    sigma: float = 0.001
+
+    def reach(self, camera: Intrinsics) -> int:
+        """It adds no returns."""
+        return 0
+
+    def apply(
+        self, depth: NDArray[np.float32], camera: Intrinsics, rng: np.random.Generator, window: Window
+    ) -> NDArray[np.float32]:
+        """See `SensorNoise.apply`."""
+        out = np.zeros(depth.shape, np.float32)
+        _add_white(depth, self.sigma, keys(rng, 1)[0], NORMAL_QUANTILES, out, *window)
+        return out
+
+
 def _check_edges(name: str, share: float, step: float) -> None:
     if not 0 <= share <= 1:
         raise ConfigError(f"{name}: share = {share} must lie between 0 and 1")
@@ -220,8 +245,9 @@ NOISE_MODELS: dict[str, tuple[SensorNoise, ...]] = {
     "stereo": (Stereo(),),
     "kinect_v1_edges": (LostEdges(0.5), KinectV1()),
     "stereo_edges": (FlyingPixels(0.3), LostEdges(0.2), Stereo()),
+    "white_1mm": (WhiteNoise(0.001),),
 }
-"""Noise by its name: each sensor with clean edges, and with the edges that cost real ones their returns."""
+"""Noise by its name: each sensor with clean edges and with those that cost real ones returns; and 1 mm everywhere."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -287,3 +313,14 @@ def _count(depth: Any, per_metre: float, out: Any, top: int, bottom: int, left: 
         for column in range(left, right):
             steps = np.rint(depth[row, column] * per_metre)
             out[row, column] = np.uint16(steps) if 0 < steps < 65535.5 else np.uint16(0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_white(
+    depth: Any, sigma: float, key: Any, quantiles: Any, out: Any, top: int, bottom: int, left: int, right: int
+) -> None:
+    for row in range(top, bottom):
+        for column in range(left, right):
+            z = depth[row, column]
+            if z > 0:
+                out[row, column] = max(z + sigma * normal(key, row * depth.shape[1] + column, quantiles), 0.0)

@@ -18,6 +18,8 @@ from ropetrace.config import Vector, from_table, read_toml
 from ropetrace.errors import ConfigError
 from ropetrace.evaluation.metrics import resample
 from ropetrace.sim.camera import DepthCamera
+from ropetrace.sim.curtain import CurtainSettings
+from ropetrace.sim.curve import CurveRope, CurveSettings
 from ropetrace.sim.noise import noise_model
 from ropetrace.sim.rope import STEPS_PER_PERIOD, TIMESTEP, EndsAt, RopeModel, RopeSimulation, RopeState, Wind
 from ropetrace.sim.scene import Boxes, Capsules, Plane, Scene, check_camera_outside, inverse_pose, looking_at
@@ -122,6 +124,8 @@ class ClutterSettings:
     """Links of a robot: capsules from x, y, z to x, y, z with a radius."""
     second_rope: Vector | None = None
     """Another rope of the same kind and colour, that moves as the first does, this far from it."""
+    rope_color: bool = False
+    """Boxes and robot have the rope's colour."""
 
     def __post_init__(self) -> None:
         for name in ("wall", "floor", "boxes", "robot", "second_rope"):
@@ -153,6 +157,8 @@ class Scenario:
     motion: MotionSettings = field(default_factory=MotionSettings)
     camera: CameraSettings = field(default_factory=CameraSettings)
     clutter: ClutterSettings = field(default_factory=ClutterSettings)
+    curtain: CurtainSettings = field(default_factory=CurtainSettings)
+    curve: CurveSettings = field(default_factory=CurveSettings)
 
     def __post_init__(self) -> None:
         if not 0 < self.duration <= 86400:
@@ -166,6 +172,12 @@ class Scenario:
                 raise ConfigError(
                     f"motion.far_end gets {apart:.3f} m from motion.anchor, and the rope is {self.rope.length:g} m long"
                 )
+        if self.curve.radius is not None and (motion != MotionSettings() or self.wind != Wind()):
+            raise ConfigError("a rope that is led along a curve takes no motion and no wind: leave out those tables")
+        if self.curve.arc > self.rope.length:
+            raise ConfigError(
+                f"the arc of curve takes {self.curve.arc:.3f} m, and the rope is {self.rope.length:g} m long"
+            )
 
     @property
     def frame_count(self) -> int:
@@ -222,16 +234,7 @@ class SimulatedScene:
         assert self.camera.world_from_camera is not None
         self.world_from_camera = self.camera.world_from_camera
         self._camera_from_world = inverse_pose(self.world_from_camera)
-        axis = self.world_from_camera[:3, 2]
-        motion = scenario.motion
-        self.rope = RopeSimulation(
-            scenario.rope,
-            motion.anchor,
-            scenario.wind,
-            lift=motion.lift,
-            ends=motion.ends(),
-            camera_axis=(float(axis[0]), float(axis[1]), float(axis[2])),
-        )
+        self.rope = _rope(scenario, self.world_from_camera[:3, 2])
         clutter = scenario.clutter
         self._planes = tuple(
             Plane(normal, place, _CLUTTER_COLOR, CLUTTER)
@@ -240,11 +243,14 @@ class SimulatedScene:
         )
         self._boxes = Boxes.none()
         for x, y, z, width, depth, height in clutter.boxes:
-            self._boxes += Boxes.one((x, y, z), (width, depth, height), _CLUTTER_COLOR, CLUTTER)
+            color = ROPE_COLOR if clutter.rope_color else _CLUTTER_COLOR
+            self._boxes += Boxes.one((x, y, z), (width, depth, height), color, CLUTTER)
         self.robot = Capsules.none()
         for link in clutter.robot:
             ends = np.array(link[:6]).reshape(2, 1, 3)
-            self.robot += Capsules.between(ends[0], ends[1], link[6], ROBOT_COLOR, CLUTTER)
+            color = ROPE_COLOR if clutter.rope_color else ROBOT_COLOR
+            self.robot += Capsules.between(ends[0], ends[1], link[6], color, CLUTTER)
+        check_camera_outside(Scene(Capsules.none(), boxes=self._curtain(math.inf)), self.world_from_camera)
         check_camera_outside(self.scene(), self.world_from_camera)
 
     def scene(self) -> Scene:
@@ -256,7 +262,10 @@ class SimulatedScene:
             capsules += Capsules.between(
                 starts + aside, ends + aside, self.scenario.rope.radius, ROPE_COLOR, SECOND_ROPE
             )
-        return Scene(capsules + self.robot, self._planes, self._boxes)
+        return Scene(capsules + self.robot, self._planes, self._boxes + self._curtain(self.rope.time))
+
+    def _curtain(self, time: float) -> Boxes:
+        return self.scenario.curtain.boxes(time, _CLUTTER_COLOR, CLUTTER)
 
     def truth(self) -> Truth:
         """What is true now."""
@@ -305,6 +314,22 @@ class SimulatedScene:
 
         frame = self.camera.expose(scene_at, stamp, index)
         return frame, truths[0]
+
+
+def _rope(scenario: Scenario, camera_axis: FloatArray) -> RopeSimulation | CurveRope:
+    """What moves the rope: physics, or the curve that it is led along."""
+    axis = (float(camera_axis[0]), float(camera_axis[1]), float(camera_axis[2]))
+    if scenario.curve.radius is not None:
+        return CurveRope(scenario.curve, scenario.rope, axis)
+    motion = scenario.motion
+    return RopeSimulation(
+        scenario.rope,
+        motion.anchor,
+        scenario.wind,
+        lift=motion.lift,
+        ends=motion.ends(),
+        camera_axis=axis,
+    )
 
 
 def scenario_names() -> list[str]:
