@@ -83,7 +83,7 @@ class Rope:
     config: Annotated[Path | None, arg(metavar="FILE")] = None
     """A TOML file with further settings; those given here count first."""
     method: Annotated[str | None, arg(metavar="NAME")] = None
-    """The tracker: slicing (the default)."""
+    """The tracker: slicing (the default), schulman, cpd, gltp, spr, trackdlo or cdcpd."""
 
     def settings(self) -> RopeConfig:
         """The settings of the file and the command line together."""
