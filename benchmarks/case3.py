@@ -18,7 +18,6 @@ import numpy as np
 
 from ropetrace.evaluation.case3 import (
     HEIGHTS,
-    TUNED,
     Case3Settings,
     Tracked,
     choose_cases,
@@ -26,6 +25,7 @@ from ropetrace.evaluation.case3 import (
 )
 from ropetrace.evaluation.case3_mocap import run_motion_capture
 from ropetrace.evaluation.case3_report import means_table, summary_table, write_report
+from ropetrace.evaluation.methods import TUNED
 
 DATA = Path(os.environ.get("ROPETRACE_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

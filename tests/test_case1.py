@@ -20,11 +20,21 @@ import pytest
 pytest.importorskip("mujoco")
 
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
-from ropetrace.evaluation import case_files, runner
-from ropetrace.evaluation.case1 import CONDITIONS, Case, Case1Settings, Readings, frame_stamps, run_case, schedule
+from ropetrace.evaluation import runner
+from ropetrace.evaluation.case1 import (
+    CONDITIONS,
+    Case,
+    Case1Settings,
+    Readings,
+    frame_stamps,
+    measure_compute_time,
+    run_case,
+    schedule,
+)
 from ropetrace.evaluation.case1_report import COLUMNS, csv_text, report_text, summary_table, write_report
 from ropetrace.evaluation.case_files import CaseFolder
 from ropetrace.evaluation.experiments import CASE1, choose_cases
+from ropetrace.evaluation.methods import TUNED
 from ropetrace.evaluation.runner import run_cases
 
 REAL_TIME, SLOW_MOTION = CONDITIONS
@@ -100,6 +110,20 @@ def test_a_case_repeats_bit_for_bit() -> None:
     assert first.count("\n") == 21
 
 
+@pytest.mark.parametrize("method", ["cpd", TUNED])
+def test_another_method_is_timed_and_judged_alike(method: str) -> None:
+    settings = replace(SHORT, method=method, latency=None)
+    seconds = measure_compute_time(SLOW_MOTION, settings, frames=3)
+    assert 0 < seconds < 0.05
+    real = measure_compute_time(REAL_TIME, settings, frames=3)
+    readings = run_case(REAL_TIME, 0.8, settings, real)
+    assert np.nanmin(readings.age) >= real - 1e-9
+    assert np.nanmean(readings.linear_at_stamp) < 0.02
+    report = report_text({Case(REAL_TIME, 0.8): readings}, settings, {"30fps": real})
+    assert f"tracker: {method};" in report
+    assert "its own method, slicing" in report
+
+
 def test_a_rope_at_rest_is_found_to_a_tenth_of_a_millimetre() -> None:
     for condition in CONDITIONS:
         readings = run_case(condition, 0.0, SHORT, 0.001)
@@ -149,19 +173,19 @@ def test_a_run_goes_on_where_it_stopped_and_gives_the_same_bytes(tmp_path: Path)
     assert run_in(tmp_path / "case1", replace(SHORT, latency=0.04), overwrite=True) != whole
 
 
-def test_the_compute_time_is_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_compute_time_is_measured_once(tmp_path: Path) -> None:
     measured: list[str] = []
 
     def measure(condition: object, settings: object) -> float:
         measured.append(str(condition))
         return 0.001 * len(measured)
 
-    monkeypatch.setattr(case_files, "measure_compute_time", measure)
+    experiment = replace(CASE1, measure=measure)
     settings = replace(SHORT, latency=None)
-    folder = CaseFolder(tmp_path / "case1", CASE1)
+    folder = CaseFolder(tmp_path / "case1", experiment)
     assert folder.begin(settings, [REAL_TIME]) == {"30fps": 0.001}
     assert folder.begin(settings, CONDITIONS) == {"30fps": 0.001, "60fps": 0.002}
-    assert CaseFolder(tmp_path / "case1", CASE1).begin(settings, CONDITIONS) == {"30fps": 0.001, "60fps": 0.002}
+    assert CaseFolder(tmp_path / "case1", experiment).begin(settings, CONDITIONS) == {"30fps": 0.001, "60fps": 0.002}
     assert len(measured) == 2
     assert folder.begin(settings, [REAL_TIME], overwrite=True) == {"30fps": 0.003}
 

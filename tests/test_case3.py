@@ -20,19 +20,21 @@ from ropetrace.errors import ConfigError, RecordingError
 from ropetrace.evaluation import case3
 from ropetrace.evaluation.case3 import (
     HEIGHTS,
-    TUNED,
     Case3,
     Case3Settings,
     MarkerTrack,
     Tracked,
-    case_tracker,
     choose_cases,
     errors,
     run_case,
 )
 from ropetrace.evaluation.case3_mocap import run_motion_capture
 from ropetrace.evaluation.case3_report import csv_text, report_text, write_report
+from ropetrace.evaluation.case_files import CaseFolder
 from ropetrace.evaluation.clocks import clock_offset
+from ropetrace.evaluation.experiments import CASE3
+from ropetrace.evaluation.methods import CASE_METHODS, TUNED, case_tracker
+from ropetrace.evaluation.runner import run_cases
 from ropetrace.sim.pipe import PipeModel, PipeSimulation, lifted_angles
 from ropetrace.types import Estimate, FloatArray, Status, Waypoints
 
@@ -204,6 +206,32 @@ def test_the_cases_are_the_papers() -> None:
     assert [round(height * 1e3) for height in HEIGHTS] == [0, 5, 10, 15, 20, 25, 30, 35, 40, 45]
     assert len({case.name for case in cases}) == 60
     assert cases[4].name == "slicing_5mm_2"
+    assert choose_cases(["slicing", "schulman", "slicing"]) == cases
+    for methods, said in (([], "no method"), (["slicing", "guessing"], "unknown method 'guessing': choose of slicing")):
+        with pytest.raises(ConfigError, match=said):
+            choose_cases(methods)
+
+
+def test_a_run_goes_on_where_it_stopped_and_takes_further_methods(tmp_path: Path) -> None:
+    settings = replace(SHORT, duration=0.5)
+    folder = CaseFolder(tmp_path / "case3", CASE3)
+    first = choose_cases(["slicing"], (0.0, 0.005), 1)
+    assert folder.begin(settings) == {}
+    run_cases(folder, first, settings, {}, jobs=1)
+    kept = [folder.case_path(case).stat().st_mtime_ns for case in first]
+    assert folder.begin(settings) == {}
+    both = choose_cases(["slicing", TUNED], (0.0, 0.005), 1)
+    assert folder.finished(both) == first
+    counts: list[int] = []
+    run_cases(folder, both, settings, {}, jobs=1, on_progress=counts.append)
+    assert sum(counts) == 2
+    assert [folder.case_path(case).stat().st_mtime_ns for case in first] == kept
+    loaded, again = folder.load(first[1]), run_case(first[1], settings)
+    for item in fields(Tracked):
+        assert np.array_equal(getattr(loaded, item.name), getattr(again, item.name), equal_nan=item.name != "status")
+    with pytest.raises(ConfigError, match='noise: "stereo", now "none"'):
+        folder.begin(replace(settings, noise="none"))
+    assert "compute_time" not in (tmp_path / "case3" / "settings.toml").read_text()
 
 
 def example_results() -> dict[Case3, Tracked]:
@@ -254,3 +282,5 @@ def test_methods_are_found_by_their_names() -> None:
     config = RopeConfig(0.025)
     assert type(case_tracker("slicing", config)).__name__ == "SlicingTracker"
     assert type(case_tracker(TUNED, config)).__name__ == "SchulmanTracker"
+    for method in CASE_METHODS:
+        case_tracker(method, config)

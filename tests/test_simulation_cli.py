@@ -158,6 +158,17 @@ def test_an_impossible_scenario_is_refused_before_anything_is_written(tmp_path: 
         (Reproduce("case1", frequencies=(13.0,)), "resolves"),
         (Reproduce("case1", jobs=0), "--jobs 0"),
         (Reproduce("case1", placement="behind"), "--placement means nothing for case1"),
+        (Reproduce("case1", method="guessing"), "unknown method 'guessing'"),
+        (Reproduce("case1", methods=("slicing",)), "--methods means nothing for case1"),
+        (Reproduce("case2", method="slicing"), "--method means nothing for case2"),
+        (Reproduce("case3", methods=("guessing",)), "unknown method 'guessing'"),
+        (Reproduce("case3", methods=()), "no method"),
+        (Reproduce("case3", noise="fog"), "noise model"),
+        (Reproduce("case3", jobs=0), "--jobs 0"),
+        (Reproduce("case3", method="slicing"), "--method means nothing for case3"),
+        (Reproduce("case3", latency="1ms"), "--latency means nothing for case3"),
+        (Reproduce("case3", conditions=("30fps",)), "--conditions means nothing for case3"),
+        (Reproduce("case3", frequencies=(0.0,)), "--frequencies means nothing for case3"),
         (Reproduce("case2", predict="now"), "--predict means nothing for case2"),
         (Reproduce("case2", phase=0.5), "--phase means nothing for case2"),
         (Reproduce("case2", noise="fog"), "noise model"),
@@ -253,6 +264,27 @@ def test_reproduce_case2_prints_the_table_and_goes_on(
     assert capsys.readouterr().out == said
     with pytest.raises(ConfigError, match="begun with other settings"):
         dataclasses.replace(command, placement="beside_camera").run()
+
+
+def test_reproduce_case3_prints_the_tables_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("ropetrace.cli_simulation.QUICK_DROP_SECONDS", 2.5)
+    monkeypatch.setattr("ropetrace.cli_simulation.QUICK_HEIGHTS", (0.0, 0.02))
+    monkeypatch.chdir(tmp_path)
+    command = Reproduce("case3", quick=True, methods=("slicing",), jobs=1)
+    assert command.run() == 0
+    said = capsys.readouterr().out
+    assert "30.3" in said
+    for name in ("case3.csv", "case3.md", "case3.png"):
+        assert f"case3/{name}" in said
+        assert (tmp_path / "case3" / name).stat().st_size > 100
+    before = (tmp_path / "case3" / "case3.csv").read_bytes()
+    assert command.run() == 0
+    assert capsys.readouterr().out == said
+    assert (tmp_path / "case3" / "case3.csv").read_bytes() == before
+    with pytest.raises(ConfigError, match="begun with other settings"):
+        dataclasses.replace(command, noise="none").run()
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("40ms", 0.04), ("0.04s", 0.04), (" 0.04 ", 0.04), ("1e-3 s", 0.001)])

@@ -213,6 +213,8 @@ class Recorder:
         self.told: list[int] = []
         self.ahead: list[float] = []
 
+    stamp_ns: int | None = None
+
     def update(self, stamp_ns: int, waypoints: Waypoints) -> Motion | None:
         self.told.append(stamp_ns)
         self._places = waypoints.positions

@@ -9,18 +9,27 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from ropetrace.errors import ConfigError, import_extra
 from ropetrace.terminal import INTERRUPTED, progress_bar
 
+if TYPE_CHECKING:
+    from ropetrace.evaluation.experiments import Experiment
+
 QUICK_SECONDS = 10.0
 """Of a case of case1, with --quick."""
 
 QUICK_FREQUENCIES = (0.0, 0.8, 1.6)
 """Of the wind in case2, with --quick, Hz."""
+
+QUICK_HEIGHTS = (0.0, 0.020, 0.045)
+"""Of the drops in case3, with --quick, metres."""
+
+QUICK_DROP_SECONDS = 5.0
+"""Of a drop in case3, with --quick."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +88,10 @@ class Simulate:
         return 0
 
 
+Plan = tuple["Experiment[Any, Any, Any]", Any, Any, list[Any]]
+"""An experiment, the module of its report, its settings, and its cases."""
+
+
 @dataclass(frozen=True)
 class Reproduce:
     """Repeat an experiment of the paper in simulation, and set the result beside its figures.
@@ -88,21 +101,31 @@ class Reproduce:
     ropetrace reproduce case1 --quick
     """
 
-    experiment: Positional[Literal["case1", "case2"]]
-    """case1: the error of the tracker on a rope that sways in a wind (section 6.2, Figure 4). case2: a simulated arm
-    traces that rope (section 6.3, Figure 6)."""
+    experiment: Positional[Literal["case1", "case2", "case3"]]
+    """case1: the error of a tracker on a rope that sways in a wind (section 6.2, Figures 4 and 5). case2: a simulated
+    arm traces that rope (section 6.3, Figure 6). case3: trackers of a pipe that is dropped (section 6.4, Figure 8)."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="PATH")] = None
     """The folder for the results; by default the name of the experiment."""
     quick: bool = False
-    """case1: 10 s of simulated time a case in the place of 300 s. case2: one tracing a case, at 0, 0.8 and 1.6 Hz."""
-    conditions: tuple[Literal["30fps", "60fps"], ...] = ("30fps", "60fps")
-    """30fps: 480x360 in real time; 60fps: 1280x720 in a tenth of real time. The report shows those chosen."""
+    """case1: 10 s of simulated time a case in the place of 300 s. case2: one tracing a case, at 0, 0.8 and 1.6 Hz.
+    case3: one drop of 5 s from 0, 20 and 45 mm each."""
+    method: Annotated[str | None, arg(metavar="NAME")] = None
+    """case1 only. The tracker: slicing (by default), any other that `ropetrace track` has, or schulman_tuned, which is
+    schulman with parameters tuned for this rope."""
+    methods: Annotated[tuple[str, ...] | None, arg(metavar="NAME ...")] = None
+    """case3 only. The trackers, named as for --method, with spaces or commas between them; by default slicing and
+    schulman. Further ones join a run."""
+    conditions: tuple[Literal["30fps", "60fps"], ...] | None = None
+    """case1 and case2. 30fps: 480x360 in real time; 60fps: 1280x720 in a tenth of real time. By default both; the
+    report shows those chosen."""
     frequencies: Annotated[tuple[float, ...] | None, arg(metavar="HZ ...")] = None
-    """Of the wind, Hz; by default 0 to 1.6 in steps of 0.2."""
-    noise: str = "none"
-    """Of the depth camera: none (as in the paper), kinect_v1, stereo, kinect_v1_edges, stereo_edges."""
+    """case1 and case2. Of the wind, Hz; by default 0 to 1.6 in steps of 0.2."""
+    noise: str | None = None
+    """Of the depth camera: none, kinect_v1, stereo, kinect_v1_edges, stereo_edges. By default none (as in the paper),
+    and stereo in case3, whose camera was a real one."""
     latency: Annotated[str | None, arg(metavar="DURATION")] = None
-    """From a frame's arrival to its centreline, such as 40ms of simulated time; by default measured on this machine."""
+    """case1 and case2. From a frame's arrival to its centreline, such as 40ms of simulated time; by default measured on
+    this machine."""
     predict: Literal["none", "now"] | None = None
     """case1 only. now: each reading asks for the centreline of its own moment, predicted from what is available then;
     by default none. The arm of case2 always predicts."""
@@ -122,30 +145,18 @@ class Reproduce:
     def run(self) -> int:
         import_extra("matplotlib", "sim")  # not after minutes of work
         import_extra("mujoco", "sim")
-        from ropetrace.evaluation import case1_report, case2_report
-        from ropetrace.evaluation.case1 import FREQUENCIES
         from ropetrace.evaluation.case_files import CaseFolder
-        from ropetrace.evaluation.experiments import CASE1, CASE2, Experiment, choose_cases
         from ropetrace.evaluation.runner import check_engine, run_cases
 
-        experiment: Experiment[Any, Any]
-        report: Any
-        if self.experiment == "case1":
-            experiment, report, settings = CASE1, case1_report, self._case1()
-        else:
-            import_extra("pinocchio", "arm")
-            experiment, report, settings = CASE2, case2_report, self._case2()
-        few = self.quick and self.experiment == "case2"
-        cases = choose_cases(
-            settings,
-            self.conditions,
-            (QUICK_FREQUENCIES if few else FREQUENCIES) if self.frequencies is None else self.frequencies,
-        )
+        plan = {"case1": self._case1, "case2": self._case2, "case3": self._case3}[self.experiment]
+        experiment, report, settings, cases = plan()
         check_engine(self.jobs, self.cluster)
         out = Path(self.experiment) if self.out is None else self.out
-        folder: CaseFolder[Any, Any] = CaseFolder(out, experiment)
+        folder: CaseFolder[Any, Any, Any] = CaseFolder(out, experiment)
+        timed = experiment.measure is not None
+        conditions = [*dict.fromkeys(case.condition for case in cases)] if timed else []
         try:
-            times = folder.begin(settings, [*dict.fromkeys(case.condition for case in cases)], self.overwrite)
+            times = folder.begin(settings, conditions, self.overwrite)
             with _progress(len(cases), "case") as advance:
                 advance(len(folder.finished(cases)))
                 run_cases(folder, cases, settings, times, jobs=self.jobs, cluster=self.cluster, on_progress=advance)
@@ -154,35 +165,69 @@ class Reproduce:
             print(f"ropetrace: interrupted; {done} are finished and kept in {out}", file=sys.stderr)
             return INTERRUPTED
         results = {case: folder.load(case) for case in cases}
-        paths = report.write_report(out, results, settings, times)
+        paths = report.write_report(out, results, settings, *([times] if timed else []))
         print(report.summary_table(results))
+        if self.experiment == "case3":
+            print(f"\nMean linear error over the drops, mm:\n\n{report.means_table(results)}")
         print()
         for name, path in zip(("readings", "report", "figure"), paths, strict=True):
             print(f"{name:9} {path}")
         return 0
 
-    def _case1(self) -> Any:
+    def _case1(self) -> Plan:
+        from ropetrace.evaluation import case1_report
         from ropetrace.evaluation.case1 import Case1Settings
+        from ropetrace.evaluation.experiments import CASE1
 
-        self._refuse("placement")
-        return Case1Settings(
+        self._refuse("placement", "methods")
+        settings = Case1Settings(
             duration=QUICK_SECONDS if self.quick else Case1Settings().duration,
-            noise=self.noise,
+            noise=self.noise or "none",
+            method=self.method or "slicing",
             predict=self.predict or "none",
             phase=self.phase,
             latency=None if self.latency is None else parse_duration(self.latency),
         )
+        return CASE1, case1_report, settings, self._swaying(settings)
 
-    def _case2(self) -> Any:
+    def _case2(self) -> Plan:
+        import_extra("pinocchio", "arm")
+        from ropetrace.evaluation import case2_report
         from ropetrace.evaluation.case2 import Case2Settings
+        from ropetrace.evaluation.experiments import CASE2
 
-        self._refuse("predict", "phase")
-        return Case2Settings.at(
+        self._refuse("predict", "phase", "method", "methods")
+        settings = Case2Settings.at(
             self.placement or "behind",
             tracings=1 if self.quick else Case2Settings().tracings,
-            noise=self.noise,
+            noise=self.noise or "none",
             latency=None if self.latency is None else parse_duration(self.latency),
         )
+        return CASE2, case2_report, settings, self._swaying(settings, QUICK_FREQUENCIES if self.quick else None)
+
+    def _swaying(self, settings: Any, frequencies: tuple[float, ...] | None = None) -> list[Any]:
+        """The cases of a rope in a wind; the frequencies are those without --frequencies, if not all."""
+        from ropetrace.evaluation.case1 import CONDITIONS, FREQUENCIES
+        from ropetrace.evaluation.experiments import choose_cases
+
+        conditions = [condition.name for condition in CONDITIONS] if self.conditions is None else self.conditions
+        chosen = frequencies or FREQUENCIES if self.frequencies is None else self.frequencies
+        return choose_cases(settings, conditions, chosen)
+
+    def _case3(self) -> Plan:
+        from ropetrace.evaluation import case3_report
+        from ropetrace.evaluation.case3 import HEIGHTS, REPEATS, Case3Settings, choose_cases
+        from ropetrace.evaluation.experiments import CASE3
+
+        self._refuse("method", "conditions", "frequencies", "latency", "predict", "phase", "placement")
+        settings = Case3Settings(
+            duration=QUICK_DROP_SECONDS if self.quick else Case3Settings().duration,
+            noise=self.noise or Case3Settings().noise,
+        )
+        given = ("slicing", "schulman") if self.methods is None else self.methods
+        names = [name for text in given for name in text.split(",") if name]
+        heights, repeats = (QUICK_HEIGHTS, 1) if self.quick else (HEIGHTS, REPEATS)
+        return CASE3, case3_report, settings, choose_cases(names, heights, repeats)
 
     def _refuse(self, *options: str) -> None:
         """Those that mean nothing for this experiment."""

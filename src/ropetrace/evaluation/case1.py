@@ -1,4 +1,4 @@
-"""Case study 1 (section 6.2): the tracker against the truth of a rope that sways in a wind.
+"""Case study 1 (section 6.2): a tracker against the truth of a rope that sways in a wind.
 
 Every 0.1 s of simulated time the newest centreline *available at that moment* is compared with the rope as it is then.
 Availability is simulated, not taken from the wall clock: a frame's centreline is there when its exposure has ended, the
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from ropetrace.centerline import make_waypoints
 from ropetrace.config import RopeConfig, format_color
 from ropetrace.errors import ConfigError
+from ropetrace.evaluation.methods import case_tracker, check_method
 from ropetrace.evaluation.metrics import coverage, symmetric_mean
 from ropetrace.evaluation.paper_errors import angular_errors, linear_errors
 from ropetrace.motion import MotionEstimator, make_motion
 from ropetrace.sim.rope import TIMESTEP, Wind
 from ropetrace.sim.scenario import ROPE_COLOR, CameraSettings, Scenario, SimulatedScene, Truth
-from ropetrace.trackers import make_tracker
 from ropetrace.tracking import ahead_of_time, with_motion
 from ropetrace.types import Estimate, FloatArray
 
@@ -78,6 +78,11 @@ class Case:
         """Such as 30fps_0.8, or 30fps_0.8_1 for the first of several."""
         return f"{self.condition.name}_{self.frequency!r}" + ("" if self.repeat is None else f"_{self.repeat + 1}")
 
+    @property
+    def work(self) -> float:
+        """More takes longer."""
+        return self.condition.rate * self.condition.width * self.condition.height
+
 
 @dataclass(frozen=True, slots=True)
 class Case1Settings:
@@ -92,6 +97,7 @@ class Case1Settings:
     noise: str = "none"
     """Of the depth camera: Gazebo's had none."""
     method: str = "slicing"
+    """Of `ropetrace.evaluation.methods.CASE_METHODS`."""
     predict: Literal["none", "now"] = "none"
     """`now`: whoever reads asks for the centreline of that moment, predicted from what is available then; `none`: takes
     the newest as it is, as the paper does."""
@@ -113,6 +119,7 @@ class Case1Settings:
             raise ConfigError(f"phase = {self.phase}: expected 0 to 1 frame intervals")
         if self.latency is not None and not 0 <= self.latency <= 10:
             raise ConfigError(f"latency = {self.latency} s: expected 0 to 10 s")
+        check_method(self.method)
 
     @property
     def readings(self) -> int:
@@ -195,7 +202,8 @@ def measure_compute_time(condition: Condition, settings: Case1Settings, frames: 
         return settings.latency
     simulated = SimulatedScene(scenario(condition, RESONANCE, settings))
     config = rope_config(settings)
-    tracker, motion = make_tracker(config), make_motion(config.motion.method, config.diameter)
+    tracker = case_tracker(settings.method, config)
+    motion = make_motion(config.motion.method, config.diameter)
     assert motion is not None
     seconds = []
     for index in range(frames + 5):
@@ -261,7 +269,7 @@ def run_case(condition: Condition, frequency: float, settings: Case1Settings, co
 
 def _readings(simulated: SimulatedScene, settings: Case1Settings, compute_time: float) -> Iterator[dict[str, Any]]:
     config = rope_config(settings)
-    tracker = make_tracker(config)
+    tracker = case_tracker(settings.method, config)
     motion = make_motion(config.motion.method, config.diameter) if settings.predict == "now" else None
     camera = simulated.camera
     moments = settings.warm_up + settings.interval * np.arange(1, settings.readings + 1)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -23,14 +23,14 @@ from scipy.interpolate import CubicSpline
 from ropetrace.config import OrderingConfig, RopeConfig, format_color
 from ropetrace.errors import ConfigError
 from ropetrace.evaluation.clocks import clock_offset
+from ropetrace.evaluation.methods import case_tracker, check_method
 from ropetrace.evaluation.metrics import coverage, distances_to_curve, projections
 from ropetrace.sim.camera import DepthCamera
 from ropetrace.sim.noise import noise_model
 from ropetrace.sim.pipe import PipeModel, PipeSimulation
 from ropetrace.sim.rope import TIMESTEP
 from ropetrace.sim.scene import Capsules, Scene, inverse_pose, looking_at
-from ropetrace.trackers import METHODS, Tracker, make_tracker
-from ropetrace.trackers.schulman import SWINGING, SchulmanTracker
+from ropetrace.trackers import Tracker
 from ropetrace.types import Estimate, FloatArray, RgbdFrame, moved
 
 HEIGHTS = tuple(index * 0.005 for index in range(10))
@@ -38,9 +38,6 @@ HEIGHTS = tuple(index * 0.005 for index in range(10))
 
 REPEATS = 3
 """Drops from each height."""
-
-TUNED = "schulman_tuned"
-"""The method of Schulman et al. with the parameters that were tuned for case study 1; "schulman" has the published."""
 
 COLOR = (200, 40, 30)
 _COVERED = 0.010
@@ -64,7 +61,7 @@ class Case3:
     repeat : int
         Which of the drops, from 0.
     method : str
-        Of `ropetrace.trackers`, or `TUNED`.
+        Of `ropetrace.evaluation.methods.CASE_METHODS`.
     """
 
     height: float
@@ -75,6 +72,11 @@ class Case3:
     def name(self) -> str:
         """Such as slicing_15mm_1 for the first of several."""
         return f"{self.method}_{self.height * 1e3:g}mm_{self.repeat + 1}"
+
+    @property
+    def work(self) -> float:
+        """More takes longer: every method does, next to slicing."""
+        return float(self.method != "slicing")
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +120,7 @@ class Case3Settings:
             raise ConfigError(f"markers = {self.markers}, {self.marker_spacing} m apart: expected 3 or more")
         if not 0 <= self.clock_range <= 1:
             raise ConfigError(f"clock_range = {self.clock_range}: expected 0 to 1 s")
+        noise_model(self.noise)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,21 +176,6 @@ class MarkerTrack:
     def at(self, times: FloatArray) -> FloatArray:
         """Positions at other times of the same clock, (T, M, 3), by a cubic spline; those of the ends beyond them."""
         return CubicSpline(self.times, self.positions)(np.clip(times, self.times[0], self.times[-1]))
-
-
-def case_tracker(method: str, config: RopeConfig, anchored: bool = True) -> Tracker:
-    """The tracker of a method: any by its name, or `TUNED`, which is told whether the rope hangs from its start.
-
-    Raises
-    ------
-    ConfigError
-        If there is none of that name.
-    """
-    if method == TUNED:
-        return SchulmanTracker(config, settings=replace(SWINGING, anchored=anchored))
-    if method not in METHODS:
-        raise ConfigError(f"unknown method {method!r}: choose of {', '.join([*METHODS, TUNED])}")
-    return make_tracker(replace(config, method=method))
 
 
 def camera_of(settings: Case3Settings, seed: int, pose: FloatArray | None) -> DepthCamera:
@@ -326,8 +314,19 @@ def errors(estimate: Estimate, markers: FloatArray) -> dict[str, float]:
 
 
 def choose_cases(methods: Iterable[str], heights: Iterable[float] = HEIGHTS, repeats: int = REPEATS) -> list[Case3]:
-    """The cases of some methods and heights, in the order of the tables."""
-    return [Case3(height, repeat, method) for method in methods for height in heights for repeat in range(repeats)]
+    """The cases of some methods and heights, in the order of the tables.
+
+    Raises
+    ------
+    ConfigError
+        If a method is unknown, or none is given.
+    """
+    chosen = [*dict.fromkeys(methods)]
+    if not chosen:
+        raise ConfigError("no method is chosen: give one at least, such as slicing")
+    for method in chosen:
+        check_method(method)
+    return [Case3(height, repeat, method) for method in chosen for height in heights for repeat in range(repeats)]
 
 
 def _whole_steps(times: FloatArray) -> FloatArray:

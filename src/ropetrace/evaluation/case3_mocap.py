@@ -10,7 +10,8 @@ from scipy.interpolate import CubicSpline
 
 from ropetrace.config import RopeConfig, format_color
 from ropetrace.errors import RecordingError
-from ropetrace.evaluation.case3 import COLOR, Case3Settings, MarkerTrack, Tracked, camera_of, case_tracker, judged
+from ropetrace.evaluation.case3 import COLOR, Case3Settings, MarkerTrack, Tracked, camera_of, judged
+from ropetrace.evaluation.methods import case_tracker
 from ropetrace.sim.scene import Capsules, Scene
 from ropetrace.types import RgbdFrame
 

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from ropetrace.errors import import_extra
-from ropetrace.evaluation.case3 import TUNED, Case3, Case3Settings, Tracked
+from ropetrace.evaluation.case3 import Case3, Case3Settings, Tracked
 from ropetrace.evaluation.case_files import replace_files
+from ropetrace.evaluation.methods import TUNED
 from ropetrace.evaluation.sequences import ErrorStatistics
 from ropetrace.evaluation.tables import csv_cells, markdown_table, png, spread
 from ropetrace.sim.pipe import PipeModel
@@ -165,7 +166,8 @@ def figure(results: Results) -> bytes:
     axis.grid(axis="y", color="#dddddd", linewidth=0.6)
     axis.set_axisbelow(True)
     axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(frameon=False, fontsize=8, ncols=2, loc="upper left", bbox_to_anchor=(0.0, 0.86))
+    # Above the axes, where no bar reaches.
+    axis.legend(frameon=False, fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0))
     return png(sheet)
 
 

@@ -16,12 +16,12 @@ import numpy as np
 
 from ropetrace.config import read_toml
 from ropetrace.errors import ConfigError, OutputError
-from ropetrace.evaluation.case1 import Case, Condition, measure_compute_time
-from ropetrace.evaluation.experiments import Experiment, Result, Settings
+from ropetrace.evaluation.case1 import Condition
+from ropetrace.evaluation.experiments import ComputeTimes, Experiment, Result, Settings, SomeCase
 from ropetrace.results.base import uninterrupted, writing
 
 
-class CaseFolder(Generic[Settings, Result]):
+class CaseFolder(Generic[SomeCase, Settings, Result]):
     """Where a run is kept: `settings.toml`, and a file for each case that is finished.
 
     Parameters
@@ -32,12 +32,12 @@ class CaseFolder(Generic[Settings, Result]):
         Whose cases.
     """
 
-    def __init__(self, path: Path, experiment: Experiment[Settings, Result]) -> None:
+    def __init__(self, path: Path, experiment: Experiment[SomeCase, Settings, Result]) -> None:
         self.path = path
         self.experiment = experiment
         self._settings_path = path / "settings.toml"
 
-    def begin(self, settings: Settings, conditions: Sequence[Condition], overwrite: bool = False) -> dict[str, float]:
+    def begin(self, settings: Settings, conditions: Sequence[Condition] = (), overwrite: bool = False) -> ComputeTimes:
         """Begin a run, or go on with one of the same settings.
 
         Parameters
@@ -45,13 +45,14 @@ class CaseFolder(Generic[Settings, Result]):
         settings : dataclass
             Of the run.
         conditions : sequence of Condition
-            Whose compute time is needed. What was measured before is used again.
+            Whose compute time is measured, if the experiment simulates latency. What was measured before is used again.
         overwrite : bool
             Begin anew, whatever was run before.
 
         Returns
         -------
-        dict of condition name to compute time, simulated seconds
+        ComputeTimes
+            Also of conditions that were measured before.
 
         Raises
         ------
@@ -61,19 +62,21 @@ class CaseFolder(Generic[Settings, Result]):
             If it holds something else, or cannot be written.
         """
         times = {} if overwrite else self._earlier(settings)
-        missing = [condition for condition in conditions if condition.name not in times]
-        shared = self.experiment.shared(settings)
-        times |= {condition.name: measure_compute_time(condition, shared) for condition in missing}
+        before = set(times)
+        if self.experiment.measure is not None:
+            for condition in conditions:
+                if condition.name not in times:
+                    times[condition.name] = self.experiment.measure(condition, settings)
         with writing(self.path):
             (self.path / "cases").mkdir(parents=True, exist_ok=True)
             if overwrite:
                 for file in (self.path / "cases").glob("*.npz"):
                     file.unlink()
-        if missing or overwrite:
+        if overwrite or set(times) != before or not self._settings_path.exists():
             replace_file(self._settings_path, self._settings_text(settings, times).encode())
         return times
 
-    def _earlier(self, settings: Settings) -> dict[str, float]:
+    def _earlier(self, settings: Settings) -> ComputeTimes:
         """The compute times of the run that is in the folder; none if there is none."""
         with writing(self.path):
             if self.path.exists() and not self.path.is_dir():
@@ -99,28 +102,31 @@ class CaseFolder(Generic[Settings, Result]):
             raise ConfigError(f"{self._settings_path}: [compute_time] does not hold seconds: give --overwrite")
         return times
 
-    def _settings_text(self, settings: Settings, times: dict[str, float]) -> str:
+    def _settings_text(self, settings: Settings, times: ComputeTimes) -> str:
         lines = [
             f"# Of `ropetrace reproduce {self.experiment.name}`. A run with other settings needs another folder.",
             _toml(_settings_table(settings)),
-            "",
-            "# From a frame's arrival to its centreline, simulated seconds; measured once, then applied to all.",
-            "[compute_time]",
-            *(f"{name} = {value!r}" for name, value in sorted(times.items())),
         ]
+        if times:
+            lines += [
+                "",
+                "# From a frame's arrival to its centreline, simulated seconds; measured once, then applied to all.",
+                "[compute_time]",
+                *(f"{name} = {value!r}" for name, value in sorted(times.items())),
+            ]
         return "\n".join(lines) + "\n"
 
-    def case_path(self, case: Case) -> Path:
+    def case_path(self, case: SomeCase) -> Path:
         """The file of a case."""
         return self.path / "cases" / f"{case.name}.npz"
 
-    def save(self, case: Case, result: Result) -> None:
+    def save(self, case: SomeCase, result: Result) -> None:
         """Keep a finished case: the whole file or none."""
         stream = io.BytesIO()
         np.savez(stream, **_as_dict(result))
         replace_file(self.case_path(case), stream.getvalue())
 
-    def load(self, case: Case) -> Result:
+    def load(self, case: SomeCase) -> Result:
         """A finished case.
 
         Raises
@@ -136,7 +142,7 @@ class CaseFolder(Generic[Settings, Result]):
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise OutputError(f"{path}: cannot be read ({error}): delete it, and run again") from None
 
-    def finished(self, cases: Sequence[Case]) -> list[Case]:
+    def finished(self, cases: Sequence[SomeCase]) -> list[SomeCase]:
         """Which of the cases are finished."""
         return [case for case in cases if self.case_path(case).exists()]
 

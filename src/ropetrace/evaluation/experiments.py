@@ -4,26 +4,47 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from ropetrace.errors import ConfigError
+from ropetrace.evaluation import case3
 from ropetrace.evaluation.case1 import (
     CONDITIONS,
     FREQUENCIES,
     Case,
     Case1Settings,
+    Condition,
     Readings,
+    measure_compute_time,
     run_case,
     scenario,
 )
 from ropetrace.evaluation.case2 import Case2Settings, Tracing, run_tracing
+from ropetrace.evaluation.case3 import Case3, Case3Settings, Tracked
 
+
+class Named(Protocol):
+    """What every case has, whichever the experiment."""
+
+    @property
+    def name(self) -> str:
+        """Of its file."""
+
+    @property
+    def work(self) -> float:
+        """More takes longer."""
+
+
+SomeCase = TypeVar("SomeCase", bound=Named)
 Settings = TypeVar("Settings")
 Result = TypeVar("Result")
 
+ComputeTimes = dict[str, float]
+"""From a frame's arrival to its centreline, simulated seconds, by the condition's name; empty without latency."""
+
 
 @dataclass(frozen=True, slots=True)
-class Experiment(Generic[Settings, Result]):
+class Experiment(Generic[SomeCase, Settings, Result]):
     """What differs from experiment to experiment.
 
     Parameters
@@ -32,33 +53,38 @@ class Experiment(Generic[Settings, Result]):
         As on the command line.
     result : type
         Of a case: a dataclass of arrays.
-    shared : callable
-        From the experiment's settings to those of the rope, the camera and the tracker.
     run : callable
-        Runs a case, given its settings and the time from a frame's arrival to its centreline, simulated seconds. A
-        function of this module: workers are told its name.
+        Runs a case, given its settings and the compute times. A function of this module: workers are told its name.
+    measure : callable, optional
+        The compute time under a condition. None where no latency is simulated.
     """
 
     name: str
     result: type[Result]
-    shared: Callable[[Settings], Case1Settings]
-    run: Callable[[Case, Settings, float], Result]
+    run: Callable[[SomeCase, Settings, ComputeTimes], Result]
+    measure: Callable[[Condition, Settings], float] | None = None
 
 
-def _case1_settings(settings: Case1Settings) -> Case1Settings:
-    return settings
+def _run_case1(case: Case, settings: Case1Settings, compute_times: ComputeTimes) -> Readings:
+    return run_case(case.condition, case.frequency, settings, compute_times[case.condition.name])
 
 
-def _run_case1(case: Case, settings: Case1Settings, compute_time: float) -> Readings:
-    return run_case(case.condition, case.frequency, settings, compute_time)
+def _run_case2(case: Case, settings: Case2Settings, compute_times: ComputeTimes) -> Tracing:
+    seconds = compute_times[case.condition.name]
+    return run_tracing(case.condition, case.frequency, settings, seconds, case.repeat or 0)
 
 
-def _run_case2(case: Case, settings: Case2Settings, compute_time: float) -> Tracing:
-    return run_tracing(case.condition, case.frequency, settings, compute_time, case.repeat or 0)
+def _measure_case2(condition: Condition, settings: Case2Settings) -> float:
+    return measure_compute_time(condition, settings.as_case1())
 
 
-CASE1 = Experiment("case1", Readings, _case1_settings, _run_case1)
-CASE2 = Experiment("case2", Tracing, Case2Settings.as_case1, _run_case2)
+def _run_case3(case: Case3, settings: Case3Settings, compute_times: ComputeTimes) -> Tracked:
+    return case3.run_case(case, settings)
+
+
+CASE1 = Experiment("case1", Readings, _run_case1, measure_compute_time)
+CASE2 = Experiment("case2", Tracing, _run_case2, _measure_case2)
+CASE3 = Experiment("case3", Tracked, _run_case3)
 
 
 def choose_cases(
@@ -66,7 +92,7 @@ def choose_cases(
     conditions: Sequence[str] = ("30fps", "60fps"),
     frequencies: Sequence[float] = FREQUENCIES,
 ) -> list[Case]:
-    """The cases of some conditions and frequencies, each checked; of case study 2, every tracing is a case.
+    """The cases of case study 1 or 2, of some conditions and frequencies, each checked; a tracing is a case.
 
     Raises
     ------

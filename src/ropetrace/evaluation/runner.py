@@ -21,9 +21,8 @@ from importlib.metadata import version
 from typing import Any
 
 from ropetrace.errors import ConfigError, RopetraceError, import_extra
-from ropetrace.evaluation.case1 import Case
 from ropetrace.evaluation.case_files import CaseFolder
-from ropetrace.evaluation.experiments import Result, Settings
+from ropetrace.evaluation.experiments import ComputeTimes, Result, Settings, SomeCase
 
 
 def check_engine(jobs: int | None, cluster: str | None) -> None:
@@ -45,10 +44,10 @@ def check_engine(jobs: int | None, cluster: str | None) -> None:
 
 
 def run_cases(
-    folder: CaseFolder[Settings, Result],
-    cases: Sequence[Case],
+    folder: CaseFolder[SomeCase, Settings, Result],
+    cases: Sequence[SomeCase],
     settings: Settings,
-    compute_times: dict[str, float],
+    compute_times: ComputeTimes,
     *,
     jobs: int | None = None,
     cluster: str | None = None,
@@ -60,12 +59,12 @@ def run_cases(
     ----------
     folder : CaseFolder
         Where they are kept; see `CaseFolder.begin`, which also gives `compute_times`.
-    cases : sequence of Case
+    cases : sequence
         What is run.
     settings : dataclass
         The rest.
-    compute_times : dict
-        Of each condition, by its name, simulated seconds.
+    compute_times : ComputeTimes
+        Of the conditions, if the experiment simulates latency.
     jobs : int, optional
         Cases at a time on this machine; by default as many as it has cores.
     cluster : str, optional
@@ -83,15 +82,14 @@ def run_cases(
     if not open_cases:
         return
     # The longest first: so no core is left with one at the end.
-    open_cases.sort(key=lambda case: -case.condition.rate * case.condition.width * case.condition.height)
+    open_cases.sort(key=lambda case: -case.work)
     jobs = min(jobs or len(os.sched_getaffinity(0)), len(open_cases))
     with _process_pool(jobs) if cluster is None else _dask(cluster) as executor:
-        running: dict[Future[Result], Case] = {}
+        running: dict[Future[Result], SomeCase] = {}
         with _without_interrupt():
             for case in open_cases:
-                seconds = compute_times[case.condition.name]
                 future = executor.submit(
-                    _run_case, folder.experiment.run, case, settings, seconds, version("ropetrace")
+                    _run_case, folder.experiment.run, case, settings, compute_times, version("ropetrace")
                 )
                 running[future] = case
         while running:
@@ -102,12 +100,16 @@ def run_cases(
 
 
 def _run_case(
-    run: Callable[[Case, Settings, float], Result], case: Case, settings: Settings, compute_time: float, wanted: str
+    run: Callable[[SomeCase, Settings, ComputeTimes], Result],
+    case: SomeCase,
+    settings: Settings,
+    compute_times: ComputeTimes,
+    wanted: str,
 ) -> Result:
     """Runs in a worker, perhaps on another machine."""
     if version("ropetrace") != wanted:
         raise ConfigError(f"a worker has ropetrace {version('ropetrace')}, not {wanted}")
-    return run(case, settings, compute_time)
+    return run(case, settings, compute_times)
 
 
 def _result(future: Future[Result]) -> Result:
