@@ -18,7 +18,7 @@ from ropetrace.config import RopeConfig, read_toml
 from ropetrace.errors import ConfigError, OutputError
 from ropetrace.evaluation.case_files import replace_file
 from ropetrace.evaluation.compare import Run, run_method
-from ropetrace.evaluation.runner import _process_pool, _result, _without_interrupt
+from ropetrace.evaluation.runner import process_pool, result_of, without_interrupt
 from ropetrace.recordings import open_recording
 from ropetrace.results.base import writing
 from ropetrace.sim.record import truth_path
@@ -207,7 +207,7 @@ def worker_pool(jobs: int) -> Iterator[Executor]:
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
-        with _process_pool(jobs) as pool:
+        with process_pool(jobs) as pool:
             yield pool
     finally:
         for name, value in before.items():
@@ -242,14 +242,14 @@ def run_tasks(
         If a case cannot be read, or a worker dies.
     """
     running: dict[Future[Run], Task] = {}
-    with _without_interrupt():
+    with without_interrupt():
         for task in tasks:
             if not folder.run_path(task).exists():
                 running[executor.submit(run_method, task.case, task.config, limit)] = task
     while running:
         done, _ = wait(running, timeout=1, return_when=FIRST_COMPLETED)
         for future in done:
-            folder.save(running.pop(future), _result(future))
+            folder.save(running.pop(future), result_of(future))
         on_progress(len(done))
 
 

@@ -84,9 +84,9 @@ def run_cases(
     # The longest first: so no core is left with one at the end.
     open_cases.sort(key=lambda case: -case.work)
     jobs = min(jobs or len(os.sched_getaffinity(0)), len(open_cases))
-    with _process_pool(jobs) if cluster is None else _dask(cluster) as executor:
+    with process_pool(jobs) if cluster is None else _dask(cluster) as executor:
         running: dict[Future[Result], SomeCase] = {}
-        with _without_interrupt():
+        with without_interrupt():
             for case in open_cases:
                 future = executor.submit(
                     _run_case, folder.experiment.run, case, settings, compute_times, version("ropetrace")
@@ -95,7 +95,7 @@ def run_cases(
         while running:
             done, _ = wait(running, timeout=1, return_when=FIRST_COMPLETED)
             for future in done:
-                folder.save(running.pop(future), _result(future))
+                folder.save(running.pop(future), result_of(future))
             on_progress(len(done))
 
 
@@ -112,7 +112,7 @@ def _run_case(
     return run(case, settings, compute_times)
 
 
-def _result(future: Future[Result]) -> Result:
+def result_of(future: Future[Result]) -> Result:
     try:
         return future.result()
     except RopetraceError:
@@ -126,7 +126,7 @@ def _result(future: Future[Result]) -> Result:
 
 
 @contextmanager
-def _process_pool(jobs: int) -> Iterator[Executor]:
+def process_pool(jobs: int) -> Iterator[Executor]:
     """Processes that are spawned, not forked: a fork of a process with threads can hang."""
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _start_worker)
@@ -159,7 +159,7 @@ def _dask(address: str) -> Iterator[Executor]:
 
 
 @contextmanager
-def _without_interrupt() -> Iterator[None]:
+def without_interrupt() -> Iterator[None]:
     """Processes that are started in the block never see Ctrl-C, which a terminal sends to them too."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
