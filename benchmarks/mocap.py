@@ -10,36 +10,18 @@ ideal sensor with a published noise.
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
-from ropetrace import Intrinsics, RgbdFrame, RopeConfig, Status, make_tracker
+from ropetrace import RgbdFrame, RopeConfig, Status, make_tracker
 from ropetrace.evaluation.metrics import coverage, distances_to_curve, resample, symmetric_mean
 from ropetrace.sim.camera import Capsules, RayCaster, Scene
 from ropetrace.sim.noise import kinect_axial
+from ropetrace.suite.recorded import CAMERA, mocap_curves
 from ropetrace.types import FloatArray
 
-DATA = Path(os.environ.get("ROPETRACE_DATA", Path(__file__).parents[2] / "shared" / "data"))
-CAMERA = Intrinsics(640, 480, 615.0, 615.0, 319.5, 239.5)
 RADIUS = 0.006
-DISTANCE = 1.25
-
-
-def true_curves(rope: int, sequence: int, every: int) -> tuple[FloatArray, FloatArray]:
-    """Times, and the true curve at each, (F, K, 3), for a camera that looks at the rope's middle along y."""
-    pack = np.load(DATA / "deform_mocap" / f"DLO{rope}_clean.npz")
-    markers = pack["markers"][sequence][::every].astype(float)
-    places = np.linalg.norm(np.diff(markers, axis=1), axis=2).mean(axis=0)
-    knots = np.concatenate([[0.0], np.cumsum(places)])
-    curves = CubicSpline(knots, markers, axis=1)(np.linspace(0, knots[-1], 300))
-    middle = (curves.min(axis=(0, 1)) + curves.max(axis=(0, 1))) / 2
-    centred = curves - middle
-    camera = np.stack([centred[..., 0], -centred[..., 2], centred[..., 1] + DISTANCE], axis=-1)
-    return np.arange(len(markers)) * every / 100.0, camera
 
 
 def frames(curves: FloatArray, times: FloatArray, seed: int, noise: bool = True) -> Iterator[RgbdFrame]:
@@ -57,7 +39,7 @@ def frames(curves: FloatArray, times: FloatArray, seed: int, noise: bool = True)
 
 def measure(rope: int, sequence: int, every: int, noise: bool = True) -> list[tuple[float, float, float, bool, Status]]:
     """Per frame: symmetric mean, coverage within 10 mm, paper's one-way error, swapped ends, status."""
-    times, curves = true_curves(rope, sequence, every)
+    times, curves = mocap_curves(rope, sequence, every)
     tracker = make_tracker(RopeConfig(diameter=2 * RADIUS, color="#c8281e"))
     rows = []
     first_end: int | None = None

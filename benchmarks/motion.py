@@ -19,13 +19,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from mocap import DATA, RADIUS, frames, true_curves
+from mocap import RADIUS, frames
 from ropetrace import RopeConfig, make_tracker
 from ropetrace.config import format_color
 from ropetrace.evaluation.metrics import is_reversed, node_errors, symmetric_mean
 from ropetrace.motion import METHODS
 from ropetrace.sim.rope import Wind
 from ropetrace.sim.scenario import ROPE_COLOR, CameraSettings, Scenario, SimulatedScene
+from ropetrace.suite.recorded import data_folder, mocap_curves
 from ropetrace.types import FloatArray, Motion, Waypoints
 
 AHEAD = 0.04
@@ -43,7 +44,7 @@ def captured(sequences: int) -> list[tuple[FloatArray, list[tuple[int, Waypoints
     result = []
     for rope in (1, 2):
         for sequence in range(sequences):
-            times, curves = true_curves(rope, sequence, 1)
+            times, curves = mocap_curves(rope, sequence, 1)
             tracker = make_tracker(RopeConfig(diameter=2 * RADIUS, color="#c8281e"))
             seen = []
             images = frames(curves[::3], times[::3], 1000 * rope + sequence)
@@ -161,7 +162,7 @@ def main() -> None:
     options = parser.parse_args()
     sequences, seconds = (1, 5) if options.quick else (options.sequences, options.seconds)
 
-    if DATA.is_dir():
+    if data_folder().is_dir():
         recording = captured(sequences)
         print("(a) predicted 40 ms ahead, motion capture; mm")
         print("method      frames error      what       mean  median     p95   worst  NEES_median NEES_mean")
@@ -177,7 +178,7 @@ def main() -> None:
                     f"{method:11s} {len(rows):6d} {error:10s} {what:9s}" + "".join(f"{v:8.2f}" for v in figures), nees
                 )
     else:
-        print(f"(a) left out: no recorded data in {DATA}, set ROPETRACE_DATA to their folder")
+        print(f"(a) left out: no recorded data in {data_folder()}, set ROPETRACE_DATA to their folder")
 
     for title, frequency in (("(b) swing at 0.8 Hz", 0.8), ("(c) at rest", 0.0)):
         print(f"\n{title}; velocities m/s, accelerations m/s^2")

@@ -8,7 +8,6 @@ can. Latency is simulated as in case study 1. Readings compare the tool with the
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -416,17 +415,3 @@ def trace(loop: ClosedLoop, on_reading: Callable[[dict[str, float]], None] = lam
 def _named(command: Command) -> str:
     """Why the guard brakes, without figures: the same words for the same reason."""
     return command.text.split(":")[0] if command.reason is Reason.HOLD else str(command.reason)
-
-
-def measure_control_time(condition: Condition, settings: Case2Settings) -> float:
-    """The median time of a control step on this machine, seconds: predict, trace, guard."""
-    loop = ClosedLoop(condition, 0.8, settings, 0.002)
-    while loop.time < loop.begin:
-        loop.see()
-    seconds = []
-    for _ in range(200):
-        start = time.perf_counter()
-        loop.act()
-        seconds.append(time.perf_counter() - start)
-        loop.see()
-    return float(np.median(seconds))

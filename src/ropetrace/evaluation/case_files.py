@@ -134,13 +134,7 @@ class CaseFolder(Generic[SomeCase, Settings, Result]):
         OutputError
             If it cannot be read.
         """
-        path = self.case_path(case)
-        try:
-            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
-                kind: Any = self.experiment.result
-                return cast(Result, kind(**{item.name: arrays[item.name] for item in fields(kind)}))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise OutputError(f"{path}: cannot be read ({error}): delete it, and run again") from None
+        return cast(Result, read_arrays(self.case_path(case), self.experiment.result))
 
     def finished(self, cases: Sequence[SomeCase]) -> list[SomeCase]:
         """Which of the cases are finished."""
@@ -159,6 +153,21 @@ def replace_file(path: Path, data: bytes) -> None:
     with writing(path), uninterrupted():
         part.write_bytes(data)
         os.replace(part, path)
+
+
+def read_arrays(path: Path, kind: type[Any]) -> Any:
+    """A dataclass of arrays from the NPZ file that keeps them by their names.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be read.
+    """
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
+            return kind(**{item.name: arrays[item.name] for item in fields(kind)})
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise OutputError(f"{path}: cannot be read ({error}): delete it, and run again") from None
 
 
 def replace_files(folder: Path, files: dict[str, bytes]) -> list[Path]:

@@ -11,12 +11,13 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from ropetrace.config import RopeConfig, read_toml
 from ropetrace.errors import ConfigError, OutputError
-from ropetrace.evaluation.case_files import replace_file
+from ropetrace.evaluation.case_files import read_arrays, replace_file
 from ropetrace.evaluation.compare import Run, run_method
 from ropetrace.evaluation.runner import process_pool, result_of, without_interrupt
 from ropetrace.recordings import open_recording
@@ -193,12 +194,7 @@ class RunFolder:
         OutputError
             If it cannot be read.
         """
-        path = self.run_path(task)
-        try:
-            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
-                return Run(**{item.name: arrays[item.name] for item in fields(Run)})
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise OutputError(f"{path}: cannot be read ({error}): delete it, and run again") from None
+        return cast(Run, read_arrays(self.run_path(task), Run))
 
 
 @contextmanager
