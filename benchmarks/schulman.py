@@ -18,10 +18,12 @@ from dataclasses import replace
 import numpy as np
 
 from ropetrace.config import RopeConfig, format_color
+from ropetrace.config_methods import SchulmanConfig
+from ropetrace.evaluation.methods import SWINGING
 from ropetrace.evaluation.metrics import distances_to_curve, node_errors, symmetric_mean
 from ropetrace.sim.rope import RopeModel, Wind
 from ropetrace.sim.scenario import ROPE_COLOR, CameraSettings, MotionSettings, Scenario, SimulatedScene
-from ropetrace.trackers.schulman import SWINGING, SchulmanSettings, SchulmanTracker
+from ropetrace.trackers.schulman import SchulmanTracker
 from ropetrace.types import FloatArray, RgbdFrame
 
 RATE = 30.0
@@ -29,13 +31,11 @@ ITERATION_TIME = {30: 0.2e-3, 45: 0.25e-3, 100: 0.7e-3}
 """Of an iteration by the number of nodes, on a core that does nothing else, seconds."""
 
 TRIAL = {
-    "published, 10 iterations": SchulmanSettings(nodes=45),
-    "published, 30 ms budget": SchulmanSettings(nodes=45, iterations=None, budget=0.030),
-    "anchored, k_d 0.5, 10 iterations": SchulmanSettings(nodes=45, anchored=True, damping=0.5),
-    "anchored, k_d 0.5, 30 ms budget": SchulmanSettings(
-        nodes=45, anchored=True, damping=0.5, iterations=None, budget=0.030
-    ),
-    "published, 100 nodes": SchulmanSettings(),
+    "published, 10 iterations": SchulmanConfig(nodes=45),
+    "published, 30 ms budget": SchulmanConfig(nodes=45, budget=0.030),
+    "anchored, k_d 0.5, 10 iterations": SchulmanConfig(nodes=45, anchored=True, damping=0.5),
+    "anchored, k_d 0.5, 30 ms budget": SchulmanConfig(nodes=45, anchored=True, damping=0.5, budget=0.030),
+    "published, 100 nodes": SchulmanConfig(),
     "tuned for case study 1": SWINGING,
 }
 
@@ -67,7 +67,7 @@ def trial() -> None:
     swing = views(scenario, 3.0, 2.0, 0.001)
     print("swing of 0.7 m at up to 1.3 m/s: p50 ms of CPU, node to curve mm, equal arc length mm, frames lost")
     for name, settings in TRIAL.items():
-        tracker = SchulmanTracker(RopeConfig(0.012, "#c8281e"), None, swing[0][1], settings, time.process_time)
+        tracker = SchulmanTracker(RopeConfig(0.012, "#c8281e", schulman=settings), None, swing[0][1], time.process_time)
         times, errors, places = [], [], []
         for frame, curve, _ in swing:
             start = time.process_time()
@@ -83,13 +83,13 @@ def trial() -> None:
         )
 
 
-def score(settings: SchulmanSettings, swings: list[list[View]]) -> list[float]:
+def score(settings: SchulmanConfig, swings: list[list[View]]) -> list[float]:
     """Of each swing: mean symmetric distance when the estimate is there, metres; the length where there is none."""
     interval = 1 / RATE
-    age = min((settings.iterations or 0) * ITERATION_TIME[settings.nodes] / interval, 1.0)
+    age = min(settings.iterations * ITERATION_TIME[settings.nodes] / interval, 1.0)
     scores = []
     for swing in swings:
-        tracker = SchulmanTracker(RopeConfig(0.015, format_color(ROPE_COLOR)), None, None, settings)
+        tracker = SchulmanTracker(RopeConfig(0.015, format_color(ROPE_COLOR), schulman=settings))
         errors = []
         for frame, curve, later in swing:
             line = tracker.update(frame).waypoints.positions
@@ -107,10 +107,10 @@ def tune() -> None:
     still = Scenario(motion=MotionSettings(anchor=(0.05, 0.05, 0.9)), camera=CameraSettings(480, 360, exact_depth=True))
     swings.append(views(still, 1.0, 0.0, 0.001, 8))
     print("mm at 0.5, 0.7, 0.9 Hz and at rest, mean")
-    best, least = SchulmanSettings(), np.inf
+    best, least = SchulmanConfig(), np.inf
     grid = itertools.product((45,), (True,), (10, 20, 40), (1.0, 2.0, 4.0, 8.0), (0.0, 0.25, 0.5, 0.75))
     for nodes, anchored, iterations, gain, damping in grid:
-        tried = SchulmanSettings(nodes=nodes, anchored=anchored, iterations=iterations, gain=gain, damping=damping)
+        tried = SchulmanConfig(nodes=nodes, anchored=anchored, iterations=iterations, gain=gain, damping=damping)
         best, least = _better(tried, best, least, swings)
     for change in (
         {"position_deviation": 0.01},
@@ -132,17 +132,17 @@ def tune() -> None:
     ):
         best, least = _better(replace(best, **change), best, least, swings)
     print("published:")
-    for settings in (SchulmanSettings(), SchulmanSettings(anchored=True)):
+    for settings in (SchulmanConfig(), SchulmanConfig(anchored=True)):
         _better(settings, best, least, swings)
     print("best:", best)
 
 
 def _better(
-    tried: SchulmanSettings, best: SchulmanSettings, least: float, swings: list[list[View]]
-) -> tuple[SchulmanSettings, float]:
+    tried: SchulmanConfig, best: SchulmanConfig, least: float, swings: list[list[View]]
+) -> tuple[SchulmanConfig, float]:
     scores = score(tried, swings)
     mean = float(np.mean(scores))
-    usual = SchulmanSettings()
+    usual = SchulmanConfig()
     changes = ", ".join(
         f"{name}={getattr(tried, name)}" for name in tried.__slots__ if getattr(tried, name) != getattr(usual, name)
     )

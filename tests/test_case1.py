@@ -32,7 +32,6 @@ from ropetrace.evaluation.case1 import (
     schedule,
 )
 from ropetrace.evaluation.case1_report import COLUMNS, csv_text, report_text, summary_table, write_report
-from ropetrace.evaluation.case_files import CaseFolder
 from ropetrace.evaluation.experiments import CASE1, choose_cases
 from ropetrace.evaluation.methods import TUNED
 from ropetrace.evaluation.runner import run_cases
@@ -149,10 +148,10 @@ def test_cases_are_checked_before_they_run() -> None:
 def run_in(path: Path, settings: Case1Settings = SHORT, overwrite: bool = False, **options: str) -> bytes:
     """Two cases, side by side; the bytes of their readings."""
     cases = choose_cases(settings, ["30fps"], [0.0, 0.8])
-    folder = CaseFolder(path, CASE1)
-    times = folder.begin(settings, [REAL_TIME], overwrite)
+    folder = CASE1.folder(path)
+    times = CASE1.begin(folder, settings, [REAL_TIME], overwrite)
     counts: list[int] = []
-    run_cases(folder, cases, settings, times, on_progress=counts.append, jobs=2, **options)
+    run_cases(CASE1, folder, cases, settings, times, on_progress=counts.append, jobs=2, **options)
     assert len(folder.finished(cases)) == 2
     results = {case: folder.load(case) for case in cases}
     written = write_report(path, results, settings, times)
@@ -182,27 +181,27 @@ def test_the_compute_time_is_measured_once(tmp_path: Path) -> None:
 
     experiment = replace(CASE1, measure=measure)
     settings = replace(SHORT, latency=None)
-    folder = CaseFolder(tmp_path / "case1", experiment)
-    assert folder.begin(settings, [REAL_TIME]) == {"30fps": 0.001}
-    assert folder.begin(settings, CONDITIONS) == {"30fps": 0.001, "60fps": 0.002}
-    assert CaseFolder(tmp_path / "case1", experiment).begin(settings, CONDITIONS) == {"30fps": 0.001, "60fps": 0.002}
+    folder = experiment.folder(tmp_path / "case1")
+    assert experiment.begin(folder, settings, [REAL_TIME]) == {"30fps": 0.001}
+    assert experiment.begin(folder, settings, CONDITIONS) == {"30fps": 0.001, "60fps": 0.002}
+    assert experiment.begin(folder, settings, CONDITIONS) == {"30fps": 0.001, "60fps": 0.002}
     assert len(measured) == 2
-    assert folder.begin(settings, [REAL_TIME], overwrite=True) == {"30fps": 0.003}
+    assert experiment.begin(folder, settings, [REAL_TIME], overwrite=True) == {"30fps": 0.003}
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "letter.txt").write_text("dear")
     with pytest.raises(OutputError, match=r"no settings\.toml"):
-        CaseFolder(tmp_path, CASE1).begin(SHORT, [REAL_TIME])
+        CASE1.begin(CASE1.folder(tmp_path), SHORT, [REAL_TIME])
     with pytest.raises(OutputError, match="is a file"):
-        CaseFolder(tmp_path / "letter.txt", CASE1).begin(SHORT, [REAL_TIME])
+        CASE1.begin(CASE1.folder(tmp_path / "letter.txt"), SHORT, [REAL_TIME])
     assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
 
 
 def test_a_damaged_case_is_named(tmp_path: Path) -> None:
-    folder, case = CaseFolder(tmp_path / "case1", CASE1), Case(REAL_TIME, 0.8)
-    folder.begin(SHORT, [REAL_TIME])
-    folder.case_path(case).write_bytes(b"PK\x03\x04 no")
+    folder, case = CASE1.folder(tmp_path / "case1"), Case(REAL_TIME, 0.8)
+    CASE1.begin(folder, SHORT, [REAL_TIME])
+    folder.run_path(case).write_bytes(b"PK\x03\x04 no")
     with pytest.raises(OutputError, match=r"30fps_0\.8\.npz: cannot be read"):
         folder.load(case)
 
@@ -261,12 +260,12 @@ def test_ctrl_c_keeps_finished_cases_and_says_so_in_one_line(tmp_path: Path) -> 
 
 def test_a_case_that_fails_is_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "version", lambda name: "0.0.0")
-    folder = CaseFolder(tmp_path / "case1", CASE1)
+    folder = CASE1.folder(tmp_path / "case1")
     cases = choose_cases(SHORT, ["30fps"], [0.8])
     with pytest.raises(RopetraceError, match=r"a worker has ropetrace .*, not 0\.0\.0"):
-        run_cases(folder, cases, SHORT, folder.begin(SHORT, [REAL_TIME]))
+        run_cases(CASE1, folder, cases, SHORT, CASE1.begin(folder, SHORT, [REAL_TIME]))
     with pytest.raises(ConfigError, match="--jobs 0"):
-        run_cases(folder, cases, SHORT, {"30fps": 0.01}, jobs=0)
+        run_cases(CASE1, folder, cases, SHORT, {"30fps": 0.01}, jobs=0)
 
 
 def test_the_csv_has_every_reading_and_its_very_bits() -> None:

@@ -29,7 +29,6 @@ from ropetrace.evaluation.case2_report import (
     worst_table,
     write_report,
 )
-from ropetrace.evaluation.case_files import CaseFolder
 from ropetrace.evaluation.experiments import CASE2, choose_cases
 from ropetrace.evaluation.runner import run_cases
 
@@ -150,9 +149,9 @@ def test_every_tracing_is_a_case() -> None:
 def run_in(path: Path, settings: Case2Settings = SHORT) -> bytes:
     """Two tracings side by side; the bytes of their report."""
     cases = choose_cases(settings, ["30fps"], [0.0])
-    folder = CaseFolder(path, CASE2)
-    times = folder.begin(settings, [REAL_TIME])
-    run_cases(folder, cases, settings, times, jobs=2)
+    folder = CASE2.folder(path)
+    times = CASE2.begin(folder, settings, [REAL_TIME])
+    run_cases(CASE2, folder, cases, settings, times, jobs=2)
     results = {case: folder.load(case) for case in cases}
     written = write_report(path, results, settings, times)
     assert [file.name for file in written] == ["case2.csv", "case2.md", "case2.png"]

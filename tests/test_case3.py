@@ -30,7 +30,6 @@ from ropetrace.evaluation.case3 import (
 )
 from ropetrace.evaluation.case3_mocap import run_motion_capture
 from ropetrace.evaluation.case3_report import csv_text, report_text, write_report
-from ropetrace.evaluation.case_files import CaseFolder
 from ropetrace.evaluation.clocks import clock_offset
 from ropetrace.evaluation.experiments import CASE3
 from ropetrace.evaluation.methods import CASE_METHODS, TUNED, case_tracker
@@ -214,23 +213,23 @@ def test_the_cases_are_the_papers() -> None:
 
 def test_a_run_goes_on_where_it_stopped_and_takes_further_methods(tmp_path: Path) -> None:
     settings = replace(SHORT, duration=0.5)
-    folder = CaseFolder(tmp_path / "case3", CASE3)
+    folder = CASE3.folder(tmp_path / "case3")
     first = choose_cases(["slicing"], (0.0, 0.005), 1)
-    assert folder.begin(settings) == {}
-    run_cases(folder, first, settings, {}, jobs=1)
-    kept = [folder.case_path(case).stat().st_mtime_ns for case in first]
-    assert folder.begin(settings) == {}
+    assert CASE3.begin(folder, settings) == {}
+    run_cases(CASE3, folder, first, settings, {}, jobs=1)
+    kept = [folder.run_path(case).stat().st_mtime_ns for case in first]
+    assert CASE3.begin(folder, settings) == {}
     both = choose_cases(["slicing", TUNED], (0.0, 0.005), 1)
     assert folder.finished(both) == first
     counts: list[int] = []
-    run_cases(folder, both, settings, {}, jobs=1, on_progress=counts.append)
+    run_cases(CASE3, folder, both, settings, {}, jobs=1, on_progress=counts.append)
     assert sum(counts) == 2
-    assert [folder.case_path(case).stat().st_mtime_ns for case in first] == kept
+    assert [folder.run_path(case).stat().st_mtime_ns for case in first] == kept
     loaded, again = folder.load(first[1]), run_case(first[1], settings)
     for item in fields(Tracked):
         assert np.array_equal(getattr(loaded, item.name), getattr(again, item.name), equal_nan=item.name != "status")
     with pytest.raises(ConfigError, match='noise: "stereo", now "none"'):
-        folder.begin(replace(settings, noise="none"))
+        CASE3.begin(folder, replace(settings, noise="none"))
     assert "compute_time" not in (tmp_path / "case3" / "settings.toml").read_text()
 
 

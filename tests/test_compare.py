@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
+import multiprocessing
+import os
 import re
 import signal
 import subprocess
@@ -11,7 +13,6 @@ import sys
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from html.parser import HTMLParser
 from pathlib import Path
@@ -22,12 +23,13 @@ import pytest
 
 from helpers import DATA, needs_data
 from ropetrace.cli_compare import Compare
+from ropetrace.cli_source import Part, Rope
 from ropetrace.config import RopeConfig
 from ropetrace.errors import ConfigError, FrameError, OutputError, RopetraceError
-from ropetrace.evaluation import compare
+from ropetrace.evaluation import compare, workers
 from ropetrace.evaluation.compare import Figures, disagreements, run_method, telling_frames
 from ropetrace.evaluation.compare_report import write_report
-from ropetrace.evaluation.compare_runs import RunFolder, Task, run_tasks
+from ropetrace.evaluation.compare_runs import Task, comparison_folder, run_tasks
 from ropetrace.evaluation.compare_tables import CSV_COLUMNS
 from ropetrace.suite import Truth
 from ropetrace.types import BadFrame, Estimate, Event, FloatArray, Intrinsics, RgbdFrame, Status, Waypoints
@@ -77,6 +79,10 @@ class FakeTracker:
             return Estimate.lost(frame.stamp_ns, "nothing seen")
         if self.method == "crashing" and index == 4:
             raise ZeroDivisionError("a <bad>\nthing")
+        if self.method == "dying" and index == 4:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.method == "hanging" and index == 4:
+            time.sleep(600)
         if self.method == "unfit":
             raise FrameError("no colour")
         if self.method == "flipping" and index in (6, 7):
@@ -90,6 +96,12 @@ class FakeTracker:
         return Estimate(
             frame.stamp_ns, Status.OK, waypoints=Waypoints(line, np.tile([0.0, 0, 0, 1], (len(line), 1)), arc)
         )
+
+
+@pytest.fixture
+def forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that have the fakes."""
+    monkeypatch.setattr(workers, "_CONTEXT", multiprocessing.get_context("fork"))
 
 
 @pytest.fixture
@@ -215,9 +227,9 @@ def check_page(text: str) -> None:
     ET.fromstring(text.removeprefix("<!DOCTYPE html>"))
 
 
-@pytest.mark.usefixtures("fakes")
+@pytest.mark.usefixtures("fakes", "forked")
 def test_a_report_names_the_failure_and_goes_on(tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path / "out")
+    folder = comparison_folder(tmp_path / "out")
     folder.begin({"suite": "1"})
     tasks = [
         task(method, name=name, known=name != "unknown")
@@ -225,11 +237,10 @@ def test_a_report_names_the_failure_and_goes_on(tmp_path: Path) -> None:
         for method in ("crashing", "perfect", "lost")
     ]
     finished: list[int] = []
-    with ThreadPoolExecutor(1) as executor:
-        run_tasks(folder, tasks[:4], executor, on_progress=finished.append)
-        assert folder.finished(tasks) == tasks[:4]
-        before = {path: path.stat().st_mtime_ns for path in (folder.path / "runs").iterdir()}
-        run_tasks(folder, tasks, executor, on_progress=finished.append)
+    run_tasks(folder, tasks[:4], 1, on_progress=finished.append)
+    assert folder.finished(tasks) == tasks[:4]
+    before = {path: path.stat().st_mtime_ns for path in (folder.path / "runs").iterdir()}
+    run_tasks(folder, tasks, 1, on_progress=finished.append)
     assert sum(finished) == len(tasks)
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in before.items())
     (frames, tables, html), summary = write_report(folder, tasks, "A <title>", False)
@@ -251,14 +262,70 @@ def test_a_report_names_the_failure_and_goes_on(tmp_path: Path) -> None:
     assert html.read_text() == page
 
 
+@pytest.mark.usefixtures("fakes", "forked")
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_method_that_dies_or_hangs_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int) -> None:
+    monkeypatch.setattr(workers, "LONGEST_SILENCE", 2.0)
+    folder = comparison_folder(tmp_path / "out")
+    folder.begin({"suite": "1"})
+    tasks = [task(method) for method in ("dying", "perfect", "hanging", "off")]
+    run_tasks(folder, tasks, jobs)
+    runs = {task.config.method: folder.load(task) for task in tasks}
+    assert str(runs["dying"].failure) == "its process was killed (SIGKILL)"
+    assert str(runs["hanging"].failure) == "it hung: no frame was finished for 2 s"
+    for method, run in runs.items():
+        assert len(run) == FRAMES
+        assert run.has_truth
+        assert Figures.of(run, 0.005).lost == (FRAMES if method in ("dying", "hanging") else 0)
+    assert not multiprocessing.active_children()
+
+
+@dataclass(frozen=True)
+class Unreadable(FakeCase):
+    """Its frames cannot be read: what is raised, or else the process dies."""
+
+    error: Exception | None = None
+
+    def frames(self, limit: int | None = None) -> Iterator[tuple[Event, Truth | None]]:
+        yield from super().frames(3)
+        if self.error is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        else:
+            raise self.error
+
+
+@pytest.mark.usefixtures("fakes", "forked")
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OutputError("the truth is gone"), "^the truth is gone$"),
+        (ZeroDivisionError("no"), r"a run failed \(ZeroDivisionError: no\)"),
+        (None, r"fake: its frames cannot be read: its process was killed \(SIGKILL\)"),
+    ],
+)
+def test_a_case_that_cannot_be_read_is_an_error(tmp_path: Path, error: Exception | None, said: str) -> None:
+    folder = comparison_folder(tmp_path / "out")
+    folder.begin({"suite": "1"})
+    with pytest.raises(RopetraceError, match=said):
+        run_tasks(folder, [task("off"), Task(Unreadable(error=error), RopeConfig(0.01, method="perfect"))], 1)
+    assert folder.finished([task("off")]) == [task("off")]
+    assert not multiprocessing.active_children()
+
+
 def test_a_folder_of_another_comparison_is_kept(tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path / "out")
-    folder.begin({"suite": "1", "timing": False, "config": "a\nb"})
-    folder.begin({"suite": "1", "timing": False, "config": "a\nb"})
-    with pytest.raises(ConfigError, match=r"timing: False, now True.*--overwrite"):
-        folder.begin({"suite": "1", "timing": True, "config": "a\nb"})
-    with pytest.raises(ConfigError, match=r"other settings \(config\)"):
-        folder.begin({"suite": "1", "timing": False, "config": "c"})
+    folder = comparison_folder(tmp_path / "out")
+    settings = {
+        "suite": None,
+        "timing": False,
+        "recording": 'a\n"ü',
+        "config": {"diameter": 0.01, "cpd": {"nodes": 30}},
+    }
+    folder.begin(settings)
+    folder.begin(settings)
+    with pytest.raises(ConfigError, match=r"timing: false, now true.*--overwrite"):
+        folder.begin({**settings, "timing": True})
+    with pytest.raises(ConfigError, match=r"config\.cpd\.nodes: 30, now not set"):
+        folder.begin({**settings, "config": {"diameter": 0.01}})
     folder.run_path(task("slicing")).write_bytes(b"no archive")
     with pytest.raises(OutputError, match="delete it"):
         folder.load(task("slicing"))
@@ -267,11 +334,11 @@ def test_a_folder_of_another_comparison_is_kept(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").touch()
     with pytest.raises(OutputError, match="holds other things"):
-        RunFolder(tmp_path / "mine").begin({})
+        comparison_folder(tmp_path / "mine").begin({})
     (tmp_path / "file").touch()
     for place in ("file", "file/inside"):
         with pytest.raises(OutputError, match="file"):
-            RunFolder(tmp_path / place).begin({})
+            comparison_folder(tmp_path / place).begin({})
 
 
 @pytest.mark.parametrize(
@@ -280,13 +347,13 @@ def test_a_folder_of_another_comparison_is_kept(tmp_path: Path) -> None:
         ({"methods": ("slicng",)}, "did you mean slicing"),
         ({"methods": ("slicing,gpltp",)}, "unknown method 'gpltp'.*did you mean gltp"),
         ({"cases": ("still", "hairpn")}, "did you mean hairpin"),
-        ({"diameter": "12mm"}, "--diameter means nothing for the suite"),
-        ({"start": 3}, "--start means nothing for the suite"),
-        ({"limit": 0}, "--limit 0"),
+        ({"rope": Rope("12mm")}, "--diameter means nothing for the suite"),
+        ({"part": Part(start=3)}, "--start means nothing for the suite"),
+        ({"part": Part(limit=0)}, "--limit 0"),
         ({"jobs": 0}, "--jobs 0"),
         ({"jobs": 2, "timing": True}, "one run at a time"),
         ({"source": "nowhere.mcap"}, "diameter is missing"),
-        ({"source": "nowhere.mcap", "diameter": "12mm"}, "nowhere.mcap"),
+        ({"source": "nowhere.mcap", "rope": Rope("12mm")}, "nowhere.mcap"),
         ({"source": "nowhere.mcap", "cases": ("still",)}, "--cases means nothing for a recording"),
     ],
 )
@@ -301,7 +368,7 @@ def test_what_cannot_be_is_refused(given: dict[str, Any], said: str, tmp_path: P
 def test_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("mujoco")
     out = tmp_path / "out"
-    command = Compare("suite", ("slicing",), ("still",), out, limit=10)
+    command = Compare("suite", ("slicing",), ("still",), out, part=Part(limit=10))
     assert command.run() == 0
     said = capsys.readouterr().out
     assert "slicing" in said
@@ -312,7 +379,7 @@ def test_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     check_page((out / "compare.html").read_text())
     assert command.run() == 0  # from the runs that are kept
     with pytest.raises(ConfigError, match="limit: 10, now 5"):
-        Compare("suite", ("slicing",), ("still",), out, limit=5).run()
+        Compare("suite", ("slicing",), ("still",), out, part=Part(limit=5)).run()
 
 
 def test_an_interrupted_comparison_goes_on(tmp_path: Path) -> None:
@@ -334,7 +401,12 @@ def test_an_interrupted_comparison_goes_on(tmp_path: Path) -> None:
 @needs_data
 def test_a_recording_without_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = DATA / "bcpd_rope_d435"
-    options: dict[str, Any] = {"diameter": "6mm", "rate": 5.0, "limit": 3, "jobs": 1, "out": tmp_path / "out"}
+    options: dict[str, Any] = {
+        "rope": Rope("6mm"),
+        "part": Part(rate=5.0, limit=3),
+        "jobs": 1,
+        "out": tmp_path / "out",
+    }
     assert Compare(str(recording), ("slicing,cpd",), **options).run() == 0
     said = capsys.readouterr().out
     assert "length m" in said
@@ -350,9 +422,9 @@ def test_a_simulated_recording_has_its_truth(tmp_path: Path, capsys: pytest.Capt
 
     recording = tmp_path / "swing.mcap"
     assert Simulate("swing", recording, seconds=0.3).run() == 0
-    options: dict[str, Any] = {"diameter": "15mm", "color": "#c8281e", "jobs": 1, "out": tmp_path / "out"}
-    assert Compare(str(recording), ("slicing",), start=2, **options).run() == 0
+    options: dict[str, Any] = {"rope": Rope("15mm", "#c8281e"), "jobs": 1, "out": tmp_path / "out"}
+    assert Compare(str(recording), ("slicing",), part=Part(start=2), **options).run() == 0
     assert "symmetric mm" in capsys.readouterr().out
     assert len(rows_of(tmp_path / "out" / "compare.csv")) == 7
     with pytest.raises(ConfigError, match="no frames to compare on"):
-        Compare(str(recording), ("slicing",), start=99, overwrite=True, **options).run()
+        Compare(str(recording), ("slicing",), part=Part(start=99), overwrite=True, **options).run()

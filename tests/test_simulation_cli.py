@@ -234,16 +234,21 @@ def test_reproduce_prints_the_table_and_the_paths(
 ) -> None:
     monkeypatch.setattr("ropetrace.cli_simulation.QUICK_SECONDS", 0.5)
     monkeypatch.chdir(tmp_path)
-    command = Reproduce(
-        "case1", Path("out"), quick=True, conditions=("30fps",), frequencies=(0.0,), latency="5ms", jobs=1
-    )
-    assert command.run() == 0
-    said = capsys.readouterr().out
-    assert "2.69 ± 0.0892" in said
-    for name in ("case1.csv", "case1.md", "case1.png"):
-        assert f"out/{name}" in said
-        assert (tmp_path / "out" / name).stat().st_size > 100
-    assert len((tmp_path / "out" / "case1.csv").read_text().splitlines()) == 6
+    command = Reproduce("case1", quick=True, conditions=("30fps",), frequencies=(0.0,), latency="5ms", jobs=1)
+    for given, folder in (
+        (command, "case1"),
+        (dataclasses.replace(command, method="gltp"), "case1_gltp"),
+        (dataclasses.replace(command, out=Path("out"), method="gltp"), "out"),
+    ):
+        assert given.run() == 0
+        said = capsys.readouterr().out
+        assert "2.69 ± 0.0892" in said
+        for name in ("case1.csv", "case1.md", "case1.png"):
+            assert f" {folder}/{name}" in said
+            assert (tmp_path / folder / name).stat().st_size > 100
+        assert len((tmp_path / folder / "case1.csv").read_text().splitlines()) == 6
+    assert dataclasses.replace(command, method="slicing").run() == 0
+    assert " case1/case1.csv" in capsys.readouterr().out
 
 
 def test_reproduce_case2_prints_the_table_and_goes_on(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,15 +13,19 @@ pytest.importorskip("mujoco")
 
 from helpers import RED_TEXT, SHAPES, seen
 from ropetrace.config import RopeConfig
+from ropetrace.config_methods import SchulmanConfig
 from ropetrace.errors import ConfigError
+from ropetrace.evaluation.methods import SWINGING, TUNED, case_tracker
 from ropetrace.evaluation.metrics import distances_to_curve, symmetric_mean
 from ropetrace.sim.impulse_chain import ImpulseChain
-from ropetrace.trackers.schulman import SWINGING, SchulmanSettings, SchulmanTracker
+from ropetrace.trackers import make_tracker
+from ropetrace.trackers.schulman import SchulmanTracker
 from ropetrace.trackers.schulman_em import maximise, responsibilities
 from ropetrace.types import BadFrame, CloudFrame, Estimate, FloatArray, RgbdFrame, Status
 
 ROPE = RopeConfig(0.012, RED_TEXT)
-SHORT = SchulmanSettings(nodes=30)
+SHORT = SchulmanConfig(nodes=30)
+SHORT_ROPE = replace(ROPE, schulman=SHORT)
 HANGING = SHAPES["hanging"]
 
 
@@ -132,7 +137,7 @@ def swing(frames: int, speed: float = 0.3, curve: FloatArray = HANGING) -> list[
 
 
 def test_it_settles_on_a_rope_at_rest() -> None:
-    tracker = SchulmanTracker(ROPE, nodes=HANGING[::200] + [0.02, 0.01, 0.01], settings=SHORT)
+    tracker = SchulmanTracker(SHORT_ROPE, nodes=HANGING[::200] + [0.02, 0.01, 0.01])
     frame = seen(HANGING)
     for index in range(40):
         estimate = tracker.update(RgbdFrame(index, frame.depth, 1.0, frame.intrinsics, frame.color))
@@ -144,8 +149,8 @@ def test_it_settles_on_a_rope_at_rest() -> None:
 
 
 @pytest.mark.parametrize("settings", [SHORT, SWINGING])
-def test_it_follows_a_slow_swing(settings: SchulmanSettings) -> None:
-    tracker = SchulmanTracker(ROPE, settings=replace(settings, anchored=False))
+def test_it_follows_a_slow_swing(settings: SchulmanConfig) -> None:
+    tracker = SchulmanTracker(replace(ROPE, schulman=replace(settings, anchored=False)))
     errors = []
     for frame, curve in swing(45):
         estimate = tracker.update(frame)
@@ -166,7 +171,7 @@ def test_colour_and_clouds_are_taken_as_they_come() -> None:
     points[3] = np.nan
     lines = []
     for colored in (colors, None):
-        tracker = SchulmanTracker(ROPE if colored is not None else RopeConfig(0.012), settings=SHORT)
+        tracker = SchulmanTracker(SHORT_ROPE if colored is not None else replace(SHORT_ROPE, color=None))
         for index in range(3):
             estimate = tracker.update(CloudFrame(index, points, colored))
         assert symmetric_mean(estimate.waypoints.positions, curve) < 0.003
@@ -176,11 +181,11 @@ def test_colour_and_clouds_are_taken_as_they_come() -> None:
 
 def test_the_same_frames_give_the_same_bytes_and_reset_forgets() -> None:
     frames = [frame for frame, _ in swing(6)]
-    tracker = SchulmanTracker(ROPE, settings=SHORT)
+    tracker = SchulmanTracker(SHORT_ROPE)
     first = [tracker.update(frame).nodes for frame in frames]
     tracker.reset()
     again = [tracker.update(frame).nodes for frame in frames]
-    other = [SchulmanTracker(ROPE, settings=SHORT).update(frame).nodes for frame in frames[:1]]
+    other = [SchulmanTracker(SHORT_ROPE).update(frame).nodes for frame in frames[:1]]
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
     assert np.array_equal(first[0], other[0])
 
@@ -188,9 +193,9 @@ def test_the_same_frames_give_the_same_bytes_and_reset_forgets() -> None:
 def test_the_budget_is_kept() -> None:
     """By a clock that goes on by 4 ms whenever it is asked: 1 + n askings for n iterations."""
     ticks = itertools.count()
-    settings = SchulmanSettings(nodes=30, iterations=None, budget=0.030)
-    timed = SchulmanTracker(ROPE, settings=settings, clock=lambda: 0.004 * next(ticks))
-    counted = SchulmanTracker(ROPE, settings=replace(SHORT, iterations=6))
+    settings = replace(SHORT, budget=0.030)
+    timed = SchulmanTracker(replace(ROPE, schulman=settings), clock=lambda: 0.004 * next(ticks))
+    counted = SchulmanTracker(replace(ROPE, schulman=replace(SHORT, iterations=6)))
     frame = swing(1)[0][0]
     before = next(ticks)
     estimate = timed.update(frame)
@@ -198,14 +203,15 @@ def test_the_budget_is_kept() -> None:
     assert next(ticks) - before - 1 == 1 + 7
     six = counted.update(frame)
     assert not np.array_equal(estimate.nodes, six.nodes)
-    seven = SchulmanTracker(ROPE, settings=replace(SHORT, iterations=7)).update(frame)
+    seven = SchulmanTracker(replace(ROPE, schulman=replace(SHORT, iterations=7))).update(frame)
     assert np.array_equal(estimate.nodes, seven.nodes)
-    with pytest.raises(ConfigError, match="clock"):
-        SchulmanTracker(ROPE, settings=settings)
+    before = next(ticks)
+    SchulmanTracker(SHORT_ROPE, clock=lambda: next(ticks)).update(frame)
+    assert next(ticks) == before + 1
 
 
 def test_a_rope_that_leaps_is_lost_and_found_again() -> None:
-    tracker = SchulmanTracker(ROPE, settings=SHORT)
+    tracker = SchulmanTracker(SHORT_ROPE)
     for frame, _ in swing(3):
         assert tracker.update(frame).status is Status.OK
     away = HANGING + [0.35, 0.0, 0.1]
@@ -217,7 +223,7 @@ def test_a_rope_that_leaps_is_lost_and_found_again() -> None:
 
 
 def test_after_an_absence_it_goes_on() -> None:
-    tracker = SchulmanTracker(ROPE, settings=SHORT)
+    tracker = SchulmanTracker(SHORT_ROPE)
     frames = [frame for frame, _ in swing(12)]
     for frame in frames[:3]:
         start = tracker.update(frame).waypoints.positions[0]
@@ -233,7 +239,7 @@ def test_after_an_absence_it_goes_on() -> None:
 
 
 def test_a_hidden_part_is_told() -> None:
-    tracker = SchulmanTracker(ROPE, settings=SHORT)
+    tracker = SchulmanTracker(SHORT_ROPE)
     for frame, _ in swing(5):
         tracker.update(frame)
     depth = frame.depth.copy()
@@ -262,7 +268,7 @@ def bad_frames() -> dict[str, CloudFrame]:
 
 @pytest.mark.parametrize("name", bad_frames())
 def test_bad_clouds_raise_nothing(name: str) -> None:
-    config = RopeConfig(0.012)
+    config = replace(SHORT_ROPE, color=None)
     frame = bad_frames()[name]
     depth = swing(1)[0][0]
     rope = RgbdFrame(0, depth.depth, 1.0, depth.intrinsics)
@@ -272,13 +278,13 @@ def test_bad_clouds_raise_nothing(name: str) -> None:
         assert (estimate.status is Status.LOST) == (not len(estimate.nodes))
         return estimate
 
-    first = SchulmanTracker(config, settings=SHORT)
+    first = SchulmanTracker(config)
     for index in range(2):
         estimate = checked(first.update(replace(frame, stamp_ns=index)))
         assert estimate.status is not Status.OK
     first.cloud()
 
-    later = SchulmanTracker(config, settings=SHORT)
+    later = SchulmanTracker(config)
     assert checked(later.update(rope)).status is Status.OK
     for index in range(4):
         assert checked(later.update(replace(frame, stamp_ns=index + 1))).status is not Status.OK
@@ -291,10 +297,36 @@ def test_bad_clouds_raise_nothing(name: str) -> None:
     assert symmetric_mean(estimate.waypoints.positions, HANGING) < 0.005
 
 
+def test_its_settings_have_a_table(tmp_path: Path) -> None:
+    path = tmp_path / "rope.toml"
+    path.write_text(
+        'diameter = "12mm"\nmethod = "schulman"\n'
+        '[schulman]\nnodes = 30\nvoxel = "1cm"\nbudget = 0.03\nanchored = true\n'
+    )
+    config = RopeConfig.from_toml(path)
+    assert config.schulman == SchulmanConfig(nodes=30, voxel=0.01, budget=0.03, anchored=True)
+    path.write_text(config.to_toml())
+    assert RopeConfig.from_toml(path) == config
+    tracker = make_tracker(config)
+    for frame, _ in swing(2):
+        assert len(tracker.update(frame).nodes) == 29
+    path.write_text("diameter = 0.012\n[schulman]\nnode = 30\n")
+    with pytest.raises(ConfigError, match=r"unknown setting schulman\.node: did you mean schulman\.nodes\?"):
+        RopeConfig.from_toml(path)
+    assert "[schulman]" not in RopeConfig(0.012, method="cpd").to_toml()
+
+
+def test_the_tuned_preset_is_told_whether_the_rope_hangs() -> None:
+    for anchored in (True, False):
+        tracker = case_tracker(TUNED, replace(ROPE, method="cpd"), anchored)
+        assert isinstance(tracker, SchulmanTracker)
+        assert tracker.settings == replace(SWINGING, anchored=anchored)
+
+
 def test_settings_that_are_impossible_are_refused() -> None:
-    for change in ({"nodes": 2}, {"iterations": None}, {"budget": 0.03}, {"gain": 0.0}, {"damping": 1.5}):
-        with pytest.raises(ConfigError):
-            SchulmanSettings(**change)  # type: ignore[arg-type]
+    for change in ({"nodes": 2}, {"iterations": 0}, {"budget": 0.0}, {"gain": 0.0}, {"damping": 1.5}):
+        with pytest.raises(ConfigError, match=f"schulman.{next(iter(change))} = "):
+            SchulmanConfig(**change)  # type: ignore[arg-type]
     for nodes in (np.zeros((5, 3)), np.full((5, 3), np.nan), np.zeros((5, 2))):
         with pytest.raises(ConfigError, match="nodes"):
             SchulmanTracker(ROPE, nodes=nodes)

@@ -18,6 +18,7 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from ropetrace.cli_compare import Compare
 from ropetrace.cli_simulation import Reproduce, Simulate, parse_duration
+from ropetrace.cli_source import Part, Source, TrackedRope
 from ropetrace.cli_trace import Trace
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
 from ropetrace.terminal import INTERRUPTED, progress_bar
@@ -26,79 +27,11 @@ if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
     from ropetrace.recordings import Recording
 
-_MOST_FRAMES = 10**12
-
 BAD_INPUT, NOTHING_FOUND, DAMAGED = 2, 1, 3
 """Exit codes: what was given is wrong; no frame gave an estimate; part of the recording was lost."""
 
 
 _DOCTOR_PICTURE = Path("ropetrace-doctor.png")
-
-
-@dataclass(frozen=True)
-class Source:
-    """Which recording, and which part of it."""
-
-    recording: Annotated[Path, tyro.conf.Positional, arg(metavar="RECORDING")]
-    """An RGB-D folder, a ROS 2 bag (.mcap, .db3, or their folder), a ROS 1 .bag, or point clouds (a folder of .npy,
-    .npz, .ply, .pcd, or one of them)."""
-    rate: Annotated[float | None, arg(metavar="HZ")] = None
-    """Frames per second, for recordings without stamps."""
-    start: Annotated[int, arg(metavar="N")] = 0
-    """Frames to skip."""
-    limit: Annotated[int | None, arg(metavar="N")] = None
-    """Frames to use at most."""
-    depth_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
-    """ROS: the depth images. Found by type if not given."""
-    color_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
-    """ROS: the colour images. Found by type if not given."""
-    cloud_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
-    """ROS: point clouds, in the place of depth images."""
-
-    def open(self) -> Recording:
-        """Open the recording."""
-        from ropetrace.recordings import open_recording
-
-        if not 0 <= self.start <= _MOST_FRAMES:
-            raise ConfigError(f"--start {self.start}: expected 0 to {_MOST_FRAMES}")
-        if self.limit is not None and not 1 <= self.limit <= _MOST_FRAMES:
-            raise ConfigError(f"--limit {self.limit}: expected 1 to {_MOST_FRAMES}")
-        return open_recording(
-            self.recording,
-            rate=self.rate,
-            depth_topic=self.depth_topic,
-            color_topic=self.color_topic,
-            cloud_topic=self.cloud_topic,
-        )
-
-
-@dataclass(frozen=True)
-class Rope:
-    """What is known of the rope."""
-
-    diameter: Annotated[str | None, arg(aliases=["-d"], metavar="LENGTH")] = None
-    """The rope's diameter, such as 12mm. Needed here or in the config."""
-    color: Annotated[str | None, arg(aliases=["-c"], metavar="'#RRGGBB'")] = None
-    """The rope's colour in full light, such as '#c8281e'. Without it, everything with depth is rope."""
-    config: Annotated[Path | None, arg(metavar="FILE")] = None
-    """A TOML file with further settings; those given here count first."""
-    method: Annotated[str | None, arg(metavar="NAME")] = None
-    """The tracker: slicing (the default), schulman, cpd, gltp, spr, trackdlo or cdcpd."""
-
-    def settings(self) -> RopeConfig:
-        """The settings of the file and the command line together."""
-        from ropetrace.config import RopeConfig, parse_length
-
-        given: dict[str, Any] = {
-            "diameter": None if self.diameter is None else parse_length(self.diameter),
-            "color": self.color,
-            "method": self.method,
-        }
-        if self.config is not None:
-            return RopeConfig.from_toml(self.config, **given)
-        if self.diameter is None:
-            raise ConfigError("the rope's diameter is missing: give --diameter, such as --diameter 12mm")
-        return RopeConfig(**{name: value for name, value in given.items() if value is not None})
 
 
 @dataclass(frozen=True)
@@ -145,7 +78,7 @@ class Track:
     """
 
     source: OmitArgPrefixes[Source]
-    rope: OmitArgPrefixes[Rope]
+    rope: OmitArgPrefixes[TrackedRope]
     out: Annotated[tuple[Path, ...], arg(aliases=["-o"], metavar="FILE ...")] = ()
     """Results: .csv, .parquet, .npz, .mcap or .rrd; several may be given."""
     picture: Annotated[Path | None, arg(metavar="FILE")] = None
@@ -172,8 +105,8 @@ class Track:
             list(self.out),
             predict=predict,
             picture=self.picture,
-            start=self.source.start,
-            limit=self.source.limit,
+            start=self.source.part.start,
+            limit=self.source.part.limit,
             mask=self.mask,
             frame=self.frame,
             view=self.view,
@@ -226,7 +159,7 @@ class Doctor:
     """Find out why tracking fails on a recording, and which setting would help."""
 
     source: OmitArgPrefixes[Source]
-    rope: OmitArgPrefixes[Rope]
+    rope: OmitArgPrefixes[TrackedRope]
     picture: Path = _DOCTOR_PICTURE
     """Where to put the picture of what the gate keeps."""
     frames: int = 20
@@ -244,7 +177,7 @@ class Doctor:
             raise OutputError(f"{self.picture} exists already: choose another name or give --overwrite")
         config = self.rope.settings()
         recording = self.source.open()
-        diagnosis = diagnose(_spread(recording, self.source, self.frames), config, recording.info())
+        diagnosis = diagnose(_spread(recording, self.source.part, self.frames), config, recording.info())
         print("\n".join(diagnosis.lines()))
         if diagnosis.picture is not None:
             save_picture(diagnosis.picture, self.picture)
@@ -468,13 +401,13 @@ def _mask(path: Path) -> Any:
         raise ConfigError(f"--mask {path}: cannot be read as an image: {error}") from None
 
 
-def _spread(recording: Recording, source: Source, count: int) -> Iterator[Any]:
+def _spread(recording: Recording, part: Part, count: int) -> Iterator[Any]:
     """About `count` frames over the recording, or over the part of it that is asked for."""
-    available = source.limit or (None if recording.frame_count is None else recording.frame_count - source.start)
+    available = part.limit or (None if recording.frame_count is None else recording.frame_count - part.start)
     every = 1 if available is None else max(available // count, 1)
-    for index, event in enumerate(recording.frames(source.start, source.limit or count * every)):
+    for index, event in enumerate(recording.frames(part.start, part.limit or count * every)):
         if index % every == 0:
-            yield source.start + index, event
+            yield part.start + index, event
 
 
 class _TruthOfDemo:

@@ -6,12 +6,13 @@ import dataclasses
 import difflib
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from ropetrace.cli_source import Part, Rope
 from ropetrace.errors import ConfigError, RopetraceError, import_extra
 from ropetrace.terminal import INTERRUPTED, progress_bar
 
@@ -42,24 +43,10 @@ class Compare:
     """The folder for compare.html, compare.md, compare.csv and the finished runs."""
     timing: bool = False
     """Run one thing at a time, on one thread, so that the times can be compared."""
-    diameter: Annotated[str | None, arg(aliases=["-d"], metavar="LENGTH")] = None
-    """Recording: the rope's diameter, such as 12mm. Needed here or in the config."""
-    color: Annotated[str | None, arg(aliases=["-c"], metavar="'#RRGGBB'")] = None
-    """Recording: the rope's colour in full light, such as '#c8281e'."""
-    config: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Recording: a TOML file with further settings; those given here count first."""
-    rate: Annotated[float | None, arg(metavar="HZ")] = None
-    """Recording: frames per second, where it has no stamps."""
-    start: Annotated[int, arg(metavar="N")] = 0
-    """Recording: frames to skip."""
-    limit: Annotated[int | None, arg(metavar="N")] = None
-    """Frames of the recording, or of each case, to use at most."""
-    depth_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
-    """ROS recording: the depth images. Found by type if not given."""
-    color_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
-    """ROS recording: the colour images. Found by type if not given."""
-    cloud_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
-    """ROS recording: point clouds, in the place of depth images."""
+    rope: OmitArgPrefixes[Rope] = field(default_factory=Rope)
+    """Of a recording."""
+    part: OmitArgPrefixes[Part] = field(default_factory=Part)
+    """Which part of a recording; of the suite, how many frames of each case to use at most."""
     jobs: Annotated[int | None, arg(aliases=["-j"], metavar="N")] = None
     """Runs at a time; by default as many as there are cores."""
     overwrite: bool = False
@@ -67,34 +54,32 @@ class Compare:
 
     def run(self) -> int:
         from ropetrace.evaluation.compare_report import write_report
-        from ropetrace.evaluation.compare_runs import RunFolder, run_tasks, settings_of, worker_pool
+        from ropetrace.evaluation.compare_runs import comparison_folder, run_tasks, settings_of
         from ropetrace.suite import SUITE_VERSION
 
-        if self.limit is not None and self.limit < 1:
-            raise ConfigError(f"--limit {self.limit}: expected 1 or more")
+        self.part.check()
         jobs = self._jobs()
         methods = self._methods()
         if self.source == "suite":
-            self._refuse("diameter", "color", "config", "rate", "start", "depth_topic", "color_topic", "cloud_topic")
+            _refuse(self.rope, "the suite")
+            _refuse(dataclasses.replace(self.part, limit=None), "the suite")
             import_extra("mujoco", "sim")
             tasks = self._suite_tasks(methods)
-            settings = settings_of(SUITE_VERSION, None, None, limit=self.limit, timing=self.timing)
+            settings = settings_of(SUITE_VERSION, None, None, limit=self.part.limit, timing=self.timing)
             title = f"ropetrace compare: suite {SUITE_VERSION}"
         else:
-            self._refuse("cases")
+            if self.cases:
+                raise ConfigError("--cases means nothing for a recording: leave it out")
             case, config = self._recording()
             tasks = [_task(case, config, method) for method in methods]
-            settings = settings_of(None, config, case, limit=self.limit, timing=self.timing)
+            settings = settings_of(None, config, case, limit=self.part.limit, timing=self.timing)
             title = f"ropetrace compare: {case.name}"
-        folder = RunFolder(self.out)
-        folder.begin(settings, self.overwrite)
-        finished = len(folder.finished(tasks))
+        folder = comparison_folder(self.out)
+        folder.begin(settings, overwrite=self.overwrite)
         try:
             with progress_bar(len(tasks), "run") as bar:
-                bar.update(finished)
-                if finished < len(tasks):
-                    with worker_pool(min(jobs, len(tasks) - finished)) as pool:
-                        run_tasks(folder, tasks, pool, self.limit, bar.update)
+                bar.update(len(folder.finished(tasks)))
+                run_tasks(folder, tasks, jobs, self.part.limit, bar.update)
             paths, summary = write_report(folder, tasks, title, self.timing)
         except KeyboardInterrupt:
             done = f"{len(folder.finished(tasks))} of {len(tasks)} runs"
@@ -128,32 +113,28 @@ class Compare:
         return [_task(case, RopeConfig(case.diameter, case.color), method) for case in cases for method in methods]
 
     def _recording(self) -> tuple[RecordedCase, RopeConfig]:
-        from ropetrace.cli import Rope, Source
         from ropetrace.evaluation.compare_runs import RecordedCase
 
-        config = Rope(self.diameter, self.color, self.config).settings()
-        source = Source(
-            Path(self.source), self.rate, self.start, self.limit, self.depth_topic, self.color_topic, self.cloud_topic
-        )
-        source.open()
+        config, part, path = self.rope.settings(), self.part, Path(self.source)
+        part.open(path)
         case = RecordedCase(
-            source.recording,
+            path,
             config.diameter,
             config.color,
-            source.start,
-            source.rate,
-            source.depth_topic,
-            source.color_topic,
-            source.cloud_topic,
+            part.start,
+            part.rate,
+            part.depth_topic,
+            part.color_topic,
+            part.cloud_topic,
         )
         return case, config
 
-    def _refuse(self, *options: str) -> None:
-        """Those that mean nothing here."""
-        for name in options:
-            if getattr(self, name) not in (None, (), 0):
-                what = "the suite" if self.source == "suite" else "a recording"
-                raise ConfigError(f"--{name.replace('_', '-')} means nothing for {what}: leave it out")
+
+def _refuse(options: Rope | Part, what: str) -> None:
+    """Options that mean nothing for what is compared."""
+    for item in dataclasses.fields(options):
+        if getattr(options, item.name) != item.default:
+            raise ConfigError(f"--{item.name.replace('_', '-')} means nothing for {what}: leave it out")
 
 
 def _task(case: Case, config: RopeConfig, method: str) -> Task:

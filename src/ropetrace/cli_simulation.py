@@ -105,7 +105,8 @@ class Reproduce:
     """case1: the error of a tracker on a rope that sways in a wind (section 6.2, Figures 4 and 5). case2: a simulated
     arm traces that rope (section 6.3, Figure 6). case3: trackers of a pipe that is dropped (section 6.4, Figure 8)."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="PATH")] = None
-    """The folder for the results; by default the name of the experiment."""
+    """The folder for the results; by default the name of the experiment, and for case1 with another method than slicing
+    case1_NAME."""
     quick: bool = False
     """case1: 10 s of simulated time a case in the place of 300 s. case2: one tracing a case, at 0, 0.8 and 1.6 Hz.
     case3: one drop of 5 s from 0, 20 and 45 mm each."""
@@ -145,21 +146,21 @@ class Reproduce:
     def run(self) -> int:
         import_extra("matplotlib", "sim")  # not after minutes of work
         import_extra("mujoco", "sim")
-        from ropetrace.evaluation.case_files import CaseFolder
         from ropetrace.evaluation.runner import check_engine, run_cases
 
         plan = {"case1": self._case1, "case2": self._case2, "case3": self._case3}[self.experiment]
         experiment, report, settings, cases = plan()
         check_engine(self.jobs, self.cluster)
-        out = Path(self.experiment) if self.out is None else self.out
-        folder: CaseFolder[Any, Any, Any] = CaseFolder(out, experiment)
+        out = self._folder()
+        folder = experiment.folder(out)
         timed = experiment.measure is not None
         conditions = [*dict.fromkeys(case.condition for case in cases)] if timed else []
         try:
-            times = folder.begin(settings, conditions, self.overwrite)
+            times = experiment.begin(folder, settings, conditions, self.overwrite)
             with _progress(len(cases), "case") as advance:
                 advance(len(folder.finished(cases)))
-                run_cases(folder, cases, settings, times, jobs=self.jobs, cluster=self.cluster, on_progress=advance)
+                engine: dict[str, Any] = {"jobs": self.jobs, "cluster": self.cluster}
+                run_cases(experiment, folder, cases, settings, times, on_progress=advance, **engine)
         except KeyboardInterrupt:
             done = f"{len(folder.finished(cases))} of {len(cases)} cases"
             print(f"ropetrace: interrupted; {done} are finished and kept in {out}", file=sys.stderr)
@@ -173,6 +174,12 @@ class Reproduce:
         for name, path in zip(("readings", "report", "figure"), paths, strict=True):
             print(f"{name:9} {path}")
         return 0
+
+    def _folder(self) -> Path:
+        """Where the results go."""
+        if self.out is not None:
+            return self.out
+        return Path(self.experiment if self.method in (None, "slicing") else f"{self.experiment}_{self.method}")
 
     def _case1(self) -> Plan:
         from ropetrace.evaluation import case1_report

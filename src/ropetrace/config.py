@@ -23,7 +23,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from ropetrace.config_methods import CdcpdConfig, CpdConfig, GltpConfig, SprConfig, TrackDloConfig
+from ropetrace.config_methods import CdcpdConfig, CpdConfig, GltpConfig, SchulmanConfig, SprConfig, TrackDloConfig
 from ropetrace.errors import ConfigError
 from ropetrace.types import FloatArray
 
@@ -263,6 +263,7 @@ class RopeConfig:
     ordering: OrderingConfig = field(default_factory=OrderingConfig)
     centerline: CenterlineConfig = field(default_factory=CenterlineConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
+    schulman: SchulmanConfig = field(default_factory=SchulmanConfig)
     cpd: CpdConfig = field(default_factory=CpdConfig)
     gltp: GltpConfig = field(default_factory=GltpConfig)
     spr: SprConfig = field(default_factory=SprConfig)
@@ -374,6 +375,7 @@ class RopeConfig:
 
 
 _METHOD_TABLES: dict[str, type[Any]] = {
+    "schulman": SchulmanConfig,
     "cpd": CpdConfig,
     "gltp": GltpConfig,
     "spr": SprConfig,

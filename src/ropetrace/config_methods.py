@@ -1,8 +1,9 @@
-"""The settings of the trackers that register nodes to the cloud: published defaults, and what differs from them.
+"""The settings of the trackers other than slicing: published defaults, and what differs from them.
 
-Common to them: `nodes`, how many; `voxel`, the edge of the cells whose centroids stand for the cloud, metres;
-`outliers`, mu, the share of points that are expected to belong to no node; `max_iterations` of expectation and
-maximisation a frame; `tolerance`, the mean step of the nodes below which they have settled, metres.
+Common to those that register nodes to the cloud: `nodes`, how many; `voxel`, the edge of the cells whose centroids
+stand for the cloud, metres; `outliers`, mu, the share of points that are expected to belong to no node;
+`max_iterations` of expectation and maximisation a frame; `tolerance`, the mean step of the nodes below which they have
+settled, metres.
 """
 
 from __future__ import annotations
@@ -15,6 +16,80 @@ from typing import Any
 from ropetrace.errors import ConfigError
 
 _LENGTH = {"unit": "length"}
+
+
+@dataclass(frozen=True, slots=True)
+class SchulmanConfig:
+    """Expectation-maximisation with a physics simulation (Schulman, Lee, Ho and Abbeel, "Tracking deformable objects
+    with point clouds", ICRA 2013).
+
+    Defaults are those of the paper and the sources that it refers to, in metres where they have 100 units a metre.
+    """
+
+    nodes: int = 100
+    """Points of the path; the rope has one link less."""
+    iterations: int = 10
+    """A frame."""
+    budget: float | None = None
+    """Seconds a frame, in the place of `iterations`: as published, it goes on until the next cloud arrives. What it
+    finds then depends on the machine and its load."""
+    voxel: float = field(default=0.02, metadata=_LENGTH)
+    position_deviation: float = field(default=0.02, metadata=_LENGTH)
+    """Prior deviation d of a point from its link along each axis, metres."""
+    color_deviation: tuple[float, float, float] = (0.4, 0.08, 0.08)
+    """The same of L*, a* and b*, in hundreds of CIELAB units. Frames without colour are told by their places alone."""
+    prior_weight: float = 10.0
+    """nu: as many points as the prior of the deviations counts for."""
+    gain: float = 1.0
+    """k_p: what a metre between a link and its points adds to its velocity in each iteration, m/s."""
+    damping: float = 0.0
+    """k_d: the part of a link's velocity that each iteration takes away."""
+    step: float = 0.015
+    """Of the simulation, seconds of its own time."""
+    steps: int = 2
+    """In an iteration."""
+    linear_damping: float = 0.75
+    angular_damping: float = 1.0
+    """Of the links, as Bullet counts it: the share of the velocity that a second takes away."""
+    joint_stiffness: float = 1e-5
+    """N m/rad: 0.1 with 1 kg a link and 100 units a metre. Bullet's spring damping of 1 is none."""
+    joint_limit: float = 0.4
+    """Radians."""
+    gravity: float = 0.1
+    """m/s^2."""
+    visibility_margin: float = field(default=0.03, metadata=_LENGTH)
+    """A link is hidden where the depth image shows something nearer than it by more than this, metres."""
+    anchored: bool = False
+    """Whether the first waypoint of the start is held where it is: for a rope that is known to hang from there."""
+    restart_after: int = 3
+    """So many lost frames in a row, and it starts again from the slicing tracker."""
+
+    def __post_init__(self) -> None:
+        if self.budget is not None:
+            _require_between("schulman", "budget", self.budget, 1e-4, 60)
+        for deviation in self.color_deviation:
+            _require_between("schulman", "color_deviation", deviation, 1e-6, 1e6)
+        _check(
+            "schulman",
+            self,
+            {
+                "nodes": (3, 401),
+                "iterations": (1, 100_000),
+                "position_deviation": (1e-6, 1e3),
+                "prior_weight": (1e-6, 1e6),
+                "gain": (1e-6, 1e6),
+                "damping": (0, 1),
+                "step": (1e-6, 10),
+                "steps": (1, 100_000),
+                "linear_damping": (0, 1),
+                "angular_damping": (0, 1),
+                "joint_stiffness": (0, 1e6),
+                "joint_limit": (1e-6, 1e3),
+                "gravity": (0, 1e3),
+                "visibility_margin": (0, 1e3),
+                "restart_after": (1, 100_000),
+            },
+        )
 
 
 @dataclass(frozen=True, slots=True)

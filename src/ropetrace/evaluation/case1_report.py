@@ -12,9 +12,8 @@ import numpy as np
 
 from ropetrace.errors import import_extra
 from ropetrace.evaluation.case1 import CONDITIONS, RESONANCE, Case, Case1Settings, Readings
-from ropetrace.evaluation.case_files import replace_files
 from ropetrace.evaluation.sequences import ErrorStatistics
-from ropetrace.evaluation.tables import condition_title, csv_cells, markdown_table, png, spread
+from ropetrace.evaluation.tables import condition_title, csv_cells, markdown_table, png, spread, write_parts
 from ropetrace.sim.rope import RopeModel
 from ropetrace.types import FloatArray
 
@@ -76,12 +75,13 @@ def write_report(
     MissingExtraError
         If Matplotlib is not installed.
     """
-    files = {
-        "case1.csv": csv_text(results).encode(),
-        "case1.md": report_text(results, settings, compute_times).encode(),
-        "case1.png": figure(results, settings.method),
-    }
-    return replace_files(folder, files)
+    return write_parts(
+        folder,
+        "case1",
+        csv_text(results),
+        report_text(results, settings, compute_times),
+        figure(results, settings.method),
+    )
 
 
 def csv_text(results: Results) -> str:

@@ -13,8 +13,7 @@ from ropetrace.control.tracing import TracingSettings
 from ropetrace.errors import import_extra
 from ropetrace.evaluation.case1 import CONDITIONS, Case, Condition
 from ropetrace.evaluation.case2 import CONTROL_RATE, Case2Settings, Tracing
-from ropetrace.evaluation.case_files import replace_files
-from ropetrace.evaluation.tables import condition_title, csv_cells, markdown_table, png, spread
+from ropetrace.evaluation.tables import condition_title, csv_cells, markdown_table, png, spread, write_parts
 from ropetrace.types import FloatArray
 
 COLUMNS = {"time_s": "time", "place": "place", "visible": "visible", "linear_m": "linear", "angular_rad": "angular"}
@@ -80,12 +79,9 @@ def write_report(
     MissingExtraError
         If Matplotlib is not installed.
     """
-    files = {
-        "case2.csv": csv_text(results).encode(),
-        "case2.md": report_text(results, settings, compute_times).encode(),
-        "case2.png": figure(results),
-    }
-    return replace_files(folder, files)
+    return write_parts(
+        folder, "case2", csv_text(results), report_text(results, settings, compute_times), figure(results)
+    )
 
 
 def csv_text(results: Results) -> str:

@@ -6,17 +6,14 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from ropetrace.config import RopeConfig, format_color
 from ropetrace.errors import RecordingError
 from ropetrace.evaluation.case3 import COLOR, Case3Settings, MarkerTrack, Tracked, camera_of, judged
 from ropetrace.evaluation.methods import case_tracker
 from ropetrace.sim.scene import Capsules, Scene
+from ropetrace.suite.recorded import MARKER_RATE, curves_through
 from ropetrace.types import RgbdFrame
-
-RATE = 100.0
-"""Of the recordings, Hz."""
 
 
 def run_motion_capture(
@@ -56,10 +53,8 @@ def run_motion_capture(
     middle = (recorded.min(axis=(0, 1)) + recorded.max(axis=(0, 1))) / 2
     # The camera looks along y at the middle of all there is.
     seen = (recorded - middle)[..., [0, 2, 1]] * [1, -1, 1] + [0, 0, settings.distance]
-    times = np.arange(len(seen)) / RATE
-    lengths = np.linalg.norm(np.diff(seen, axis=1), axis=2).mean(axis=0)
-    knots = np.concatenate([[0.0], np.cumsum(lengths)])
-    curves = CubicSpline(knots, seen, axis=1)(np.linspace(0, knots[-1], 300))
+    times = np.arange(len(seen)) / MARKER_RATE
+    curves = curves_through(seen)
     camera = camera_of(settings, settings.seed + sequence, None)
 
     def frames() -> Iterable[RgbdFrame]:

@@ -10,10 +10,9 @@ import numpy as np
 
 from ropetrace.errors import import_extra
 from ropetrace.evaluation.case3 import Case3, Case3Settings, Tracked
-from ropetrace.evaluation.case_files import replace_files
 from ropetrace.evaluation.methods import TUNED
 from ropetrace.evaluation.sequences import ErrorStatistics
-from ropetrace.evaluation.tables import csv_cells, markdown_table, png, spread
+from ropetrace.evaluation.tables import csv_cells, markdown_table, png, spread, write_parts
 from ropetrace.sim.pipe import PipeModel
 from ropetrace.types import FloatArray
 
@@ -47,12 +46,7 @@ def write_report(folder: Path, results: Results, settings: Case3Settings) -> lis
     MissingExtraError
         If Matplotlib is not installed.
     """
-    files = {
-        "case3.csv": csv_text(results).encode(),
-        "case3.md": report_text(results, settings).encode(),
-        "case3.png": figure(results),
-    }
-    return replace_files(folder, files)
+    return write_parts(folder, "case3", csv_text(results), report_text(results, settings), figure(results))
 
 
 def csv_text(results: Results) -> str:

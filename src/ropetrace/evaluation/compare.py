@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -195,7 +195,9 @@ class Figures:
         )
 
 
-def run_method(case: Case, config: RopeConfig, limit: int | None = None) -> Run:
+def run_method(
+    case: Case, config: RopeConfig, limit: int | None = None, on_frame: Callable[[], object] = lambda: None
+) -> Run:
     """A method on a case. It raises nothing that the method raises.
 
     Parameters
@@ -206,6 +208,8 @@ def run_method(case: Case, config: RopeConfig, limit: int | None = None) -> Run:
         Its `method` is run.
     limit : int, optional
         Frames to use at most.
+    on_frame : callable
+        Is called after each frame.
     """
     follower = _Follower(config)
     frames: list[_Frame] = []
@@ -215,7 +219,19 @@ def run_method(case: Case, config: RopeConfig, limit: int | None = None) -> Run:
         seconds = math.nan if estimate is None else time.perf_counter() - began
         line = np.empty((0, 3)) if estimate is None else estimate.waypoints.positions.copy()
         frames.append(_Frame(event.stamp_ns, None if estimate is None else estimate.status, seconds, line, truth))
+        on_frame()
     return _measured(frames, follower.failure)
+
+
+def run_of_failure(
+    case: Case, failure: str, limit: int | None = None, on_frame: Callable[[], object] = lambda: None
+) -> Run:
+    """The run of a method of which nothing is known but why it failed; for the rest see `run_method`."""
+    frames = []
+    for event, truth in case.frames(limit):
+        frames.append(_Frame(event.stamp_ns, None, math.nan, np.empty((0, 3)), truth))
+        on_frame()
+    return _measured(frames, failure)
 
 
 class _Follower:

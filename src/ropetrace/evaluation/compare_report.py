@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ropetrace.errors import ConfigError
-from ropetrace.evaluation.case_files import replace_files
+from ropetrace.evaluation.compare import Run
 from ropetrace.evaluation.compare_page import page
-from ropetrace.evaluation.compare_runs import RunFolder, Task
+from ropetrace.evaluation.compare_runs import Task
 from ropetrace.evaluation.compare_tables import (
     Comparison,
     case_table,
@@ -16,9 +16,12 @@ from ropetrace.evaluation.compare_tables import (
     markdown_text,
     overall_table,
 )
+from ropetrace.evaluation.run_folder import RunFolder, replace_files
 
 
-def write_report(folder: RunFolder, tasks: Sequence[Task], title: str, timed: bool) -> tuple[list[Path], str]:
+def write_report(
+    folder: RunFolder[Task, Run], tasks: Sequence[Task], title: str, timed: bool
+) -> tuple[list[Path], str]:
     """Write compare.csv, compare.md and compare.html of finished runs; the same runs give the same bytes.
 
     Parameters

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar, cast
 
 from ropetrace.errors import ConfigError
 from ropetrace.evaluation import case3
@@ -21,23 +22,19 @@ from ropetrace.evaluation.case1 import (
 )
 from ropetrace.evaluation.case2 import Case2Settings, Tracing, run_tracing
 from ropetrace.evaluation.case3 import Case3, Case3Settings, Tracked
+from ropetrace.evaluation.run_folder import Named, Result, RunFolder
 
 
-class Named(Protocol):
+class Sized(Named, Protocol):
     """What every case has, whichever the experiment."""
-
-    @property
-    def name(self) -> str:
-        """Of its file."""
 
     @property
     def work(self) -> float:
         """More takes longer."""
 
 
-SomeCase = TypeVar("SomeCase", bound=Named)
+SomeCase = TypeVar("SomeCase", bound=Sized)
 Settings = TypeVar("Settings")
-Result = TypeVar("Result")
 
 ComputeTimes = dict[str, float]
 """From a frame's arrival to its centreline, simulated seconds, by the condition's name; empty without latency."""
@@ -63,6 +60,49 @@ class Experiment(Generic[SomeCase, Settings, Result]):
     result: type[Result]
     run: Callable[[SomeCase, Settings, ComputeTimes], Result]
     measure: Callable[[Condition, Settings], float] | None = None
+
+    def folder(self, path: Path) -> RunFolder[SomeCase, Result]:
+        """Where its finished cases are kept."""
+        return RunFolder(path, self.result, f"reproduce {self.name}", "cases")
+
+    def begin(
+        self,
+        folder: RunFolder[SomeCase, Result],
+        settings: Settings,
+        conditions: Sequence[Condition] = (),
+        overwrite: bool = False,
+    ) -> ComputeTimes:
+        """Begin a run, or go on with one of the same settings.
+
+        Parameters
+        ----------
+        folder : RunFolder
+            See `folder`.
+        settings : dataclass
+            Of the run.
+        conditions : sequence of Condition
+            Whose compute time is measured, if the experiment simulates latency. What was measured before is used again.
+        overwrite : bool
+            Begin anew, whatever was run before.
+
+        Returns
+        -------
+        ComputeTimes
+            Also of conditions that were measured before.
+
+        Raises
+        ------
+        ConfigError, OutputError
+            As `RunFolder.begin`.
+        """
+        table = asdict(cast(Any, settings))
+        times = {} if overwrite else folder.measured(table)
+        if self.measure is not None:
+            for condition in conditions:
+                if condition.name not in times:
+                    times[condition.name] = self.measure(condition, settings)
+        folder.begin(table, times, overwrite)
+        return times
 
 
 def _run_case1(case: Case, settings: Case1Settings, compute_times: ComputeTimes) -> Readings:

@@ -21,8 +21,8 @@ from importlib.metadata import version
 from typing import Any
 
 from ropetrace.errors import ConfigError, RopetraceError, import_extra
-from ropetrace.evaluation.case_files import CaseFolder
-from ropetrace.evaluation.experiments import ComputeTimes, Result, Settings, SomeCase
+from ropetrace.evaluation.experiments import ComputeTimes, Experiment, Settings, SomeCase
+from ropetrace.evaluation.run_folder import Result, RunFolder
 
 
 def check_engine(jobs: int | None, cluster: str | None) -> None:
@@ -44,7 +44,8 @@ def check_engine(jobs: int | None, cluster: str | None) -> None:
 
 
 def run_cases(
-    folder: CaseFolder[SomeCase, Settings, Result],
+    experiment: Experiment[SomeCase, Settings, Result],
+    folder: RunFolder[SomeCase, Result],
     cases: Sequence[SomeCase],
     settings: Settings,
     compute_times: ComputeTimes,
@@ -57,8 +58,10 @@ def run_cases(
 
     Parameters
     ----------
-    folder : CaseFolder
-        Where they are kept; see `CaseFolder.begin`, which also gives `compute_times`.
+    experiment : Experiment
+        Whose cases.
+    folder : RunFolder
+        Where they are kept; see `Experiment.begin`, which also gives `compute_times`.
     cases : sequence
         What is run.
     settings : dataclass
@@ -78,7 +81,7 @@ def run_cases(
         If a case fails, a worker dies, or the cluster cannot be reached.
     """
     check_engine(jobs, cluster)
-    open_cases = [case for case in cases if not folder.case_path(case).exists()]
+    open_cases = [case for case in cases if not folder.run_path(case).exists()]
     if not open_cases:
         return
     # The longest first: so no core is left with one at the end.
@@ -88,14 +91,12 @@ def run_cases(
         running: dict[Future[Result], SomeCase] = {}
         with without_interrupt():
             for case in open_cases:
-                future = executor.submit(
-                    _run_case, folder.experiment.run, case, settings, compute_times, version("ropetrace")
-                )
+                future = executor.submit(_run_case, experiment.run, case, settings, compute_times, version("ropetrace"))
                 running[future] = case
         while running:
             done, _ = wait(running, timeout=1, return_when=FIRST_COMPLETED)
             for future in done:
-                folder.save(running.pop(future), result_of(future))
+                folder.save(running.pop(future), _result_of(future))
             on_progress(len(done))
 
 
@@ -112,7 +113,7 @@ def _run_case(
     return run(case, settings, compute_times)
 
 
-def result_of(future: Future[Result]) -> Result:
+def _result_of(future: Future[Result]) -> Result:
     try:
         return future.result()
     except RopetraceError:
@@ -129,7 +130,7 @@ def result_of(future: Future[Result]) -> Result:
 def process_pool(jobs: int) -> Iterator[Executor]:
     """Processes that are spawned, not forked: a fork of a process with threads can hang."""
     before = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _start_worker)
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), end_with_parent)
     try:
         yield pool
     except BaseException:
@@ -168,8 +169,8 @@ def without_interrupt() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_worker() -> None:
-    """Let a worker end when its parent is gone, even if that was killed."""
+def end_with_parent() -> None:
+    """Let this worker end when its parent is gone, even if that was killed."""
 
     def follow(parent: Any) -> None:
         parent.join()

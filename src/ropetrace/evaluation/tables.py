@@ -5,9 +5,11 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from ropetrace.evaluation.case1 import Condition
+from ropetrace.evaluation.run_folder import replace_files
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -34,6 +36,18 @@ def condition_title(condition: Condition) -> str:
     """Such as 30 fps, 480x360, real time."""
     speed = "real time" if condition.speed == 1 else f"{condition.speed:.0%} of real time"
     return f"{condition.rate:g} fps, {condition.width}x{condition.height}, {speed}"
+
+
+def write_parts(folder: Path, name: str, readings: str, report: str, figure: bytes) -> list[Path]:
+    """Write NAME.csv, NAME.md and NAME.png, each as a whole; gives their paths.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    parts = {".csv": readings.encode(), ".md": report.encode(), ".png": figure}
+    return replace_files(folder, {name + suffix: data for suffix, data in parts.items()})
 
 
 def png(sheet: Any) -> bytes:

@@ -32,7 +32,10 @@ CAMERA = Intrinsics(640, 480, 615.0, 615.0, 319.5, 239.5)
 DISTANCE = 1.25
 """From that camera to the middle of the motion, metres."""
 
-_MARKER_RATE, _EVERY = 100.0, 3
+MARKER_RATE = 100.0
+"""Of the motion capture, Hz."""
+
+_EVERY = 3
 _FRAMES = 100
 _REAL_RATE = 5.0
 
@@ -57,6 +60,13 @@ def open_case(name: str) -> MocapCase | RealCase:
     return RealCase() if name == "real_d435" else MocapCase(int(name.removeprefix("mocap_")))
 
 
+def curves_through(markers: FloatArray) -> FloatArray:
+    """Splines through the markers along a rope at each instant, (F, M, 3), metres: (F, 300, 3), metres."""
+    places = np.linalg.norm(np.diff(markers, axis=1), axis=2).mean(axis=0)
+    knots = np.concatenate([[0.0], np.cumsum(places)])
+    return np.asarray(CubicSpline(knots, markers, axis=1)(np.linspace(0, knots[-1], 300)))
+
+
 def mocap_curves(rope: int, sequence: int, every: int = _EVERY) -> tuple[FloatArray, FloatArray]:
     """Splines through the markers of the motion capture, seen by a camera that looks at their middle along y.
 
@@ -78,12 +88,10 @@ def mocap_curves(rope: int, sequence: int, every: int = _EVERY) -> tuple[FloatAr
     """
     with np.load(data_folder() / "deform_mocap" / f"DLO{rope}_clean.npz") as pack:
         markers = pack["markers"][sequence][::every].astype(float)
-    places = np.linalg.norm(np.diff(markers, axis=1), axis=2).mean(axis=0)
-    knots = np.concatenate([[0.0], np.cumsum(places)])
-    curves = CubicSpline(knots, markers, axis=1)(np.linspace(0, knots[-1], 300))
+    curves = curves_through(markers)
     centred = curves - (curves.min(axis=(0, 1)) + curves.max(axis=(0, 1))) / 2
     camera = np.stack([centred[..., 0], -centred[..., 2], centred[..., 1] + DISTANCE], axis=-1)
-    return np.arange(len(markers)) * every / _MARKER_RATE, camera
+    return np.arange(len(markers)) * every / MARKER_RATE, camera
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ def no_lap(stage: str) -> None:
 
 
 class Tracker(Protocol):
-    """Turns frames into estimates. It knows nothing of files, viewers or clocks."""
+    """Turns frames into estimates. It knows nothing of files or viewers, nor of clocks unless it is given a budget."""
 
     def update(self, frame: Frame | BadFrame, lap: Lap = no_lap) -> Estimate:
         """The estimate of one frame; of a bad frame, that it is lost.

@@ -45,13 +45,11 @@ class CdcpdTracker(NodeTracker):
         super().__init__(config, config.cdcpd.nodes, config.cdcpd.voxel, mask, nodes)
 
     def _begin(self, nodes: FloatArray) -> None:
+        super()._begin(nodes)
         settings = self.config.cdcpd
         self._kernel = gaussian_kernel(nodes, settings.beta)
         self._alignment = linear_alignment(nodes, settings.neighbors)
         self._longest = settings.stretch * float(arc_lengths(nodes)[-1]) / (len(nodes) - 1)
-
-    def _widen(self) -> None:
-        """Every frame is looked at as widely as the first."""
 
     def _fit(self, points: FloatArray, weights: FloatArray, nodes: FloatArray, frame: Frame) -> Fit:
         settings = self.config.cdcpd

@@ -34,12 +34,6 @@ class CpdTracker(NodeTracker):
     def __init__(self, config: RopeConfig, mask: Mask | None = None, nodes: FloatArray | None = None) -> None:
         super().__init__(config, config.cpd.nodes, config.cpd.voxel, mask, nodes)
 
-    def _begin(self, nodes: FloatArray) -> None:
-        """Nothing but the nodes is kept."""
-
-    def _widen(self) -> None:
-        """Every frame is looked at as widely as the first."""
-
     def _fit(self, points: FloatArray, weights: FloatArray, nodes: FloatArray, frame: Frame) -> Fit:
         settings = self.config.cpd
         scale = cloud_scale(points, weights)

@@ -30,15 +30,9 @@ class GltpTracker(NodeTracker):
     def __init__(self, config: RopeConfig, mask: Mask | None = None, nodes: FloatArray | None = None) -> None:
         super().__init__(config, config.gltp.nodes, config.gltp.voxel, mask, nodes)
 
-    def _begin(self, nodes: FloatArray) -> None:
-        self._variance: float | None = None
-
-    def _widen(self) -> None:
-        self._variance = None
-
     def _fit(self, points: FloatArray, weights: FloatArray, nodes: FloatArray, frame: Frame) -> Fit:
         settings = self.config.gltp
-        fit = register(
+        return register(
             points,
             weights,
             nodes,
@@ -51,5 +45,3 @@ class GltpTracker(NodeTracker):
             max_iterations=settings.max_iterations,
             tolerance=settings.tolerance,
         )
-        self._variance = fit.variance
-        return fit

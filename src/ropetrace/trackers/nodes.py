@@ -70,7 +70,7 @@ _KINK = np.radians(100)
 
 
 class NodeTracker(ABC):
-    """Keeps nodes on one rope from frame to frame. A method says how they move: `_begin`, `_widen` and `_fit`.
+    """Keeps nodes on one rope from frame to frame. A method says how they move: `_fit`.
 
     Parameters
     ----------
@@ -110,6 +110,8 @@ class NodeTracker(ABC):
         self._last: FloatArray | None = None
         self._losses = 0
         self._surface: FloatArray | None = None
+        self._variance: float | None = None
+        """Of the last fit, m^2; None after a start and a loss: that frame is looked at as widely as the first."""
         if self._given is not None:
             self._start_from(self._given)
 
@@ -150,6 +152,7 @@ class NodeTracker(ABC):
         except RegistrationError as error:
             return self._lose(frame, f"the registration failed: {error}", count)
         lap("registration")
+        self._variance = fit.variance
         trouble, is_lost = self._judge(fit, cloud, weights)
         if is_lost:
             return self._lose(frame, trouble[0], count)
@@ -163,13 +166,9 @@ class NodeTracker(ABC):
             return Cloud(points, np.full(len(points), -1, np.int32))
         return Cloud(points, nearest_nodes(points, self._found).astype(np.int32))
 
-    @abstractmethod
     def _begin(self, nodes: FloatArray) -> None:
-        """Told of the nodes, (count, 3), that a start begins with, on the surface, metres."""
-
-    @abstractmethod
-    def _widen(self) -> None:
-        """Told that the frame was lost: the next one is to be looked at as widely as the first."""
+        """Start with these nodes, (count, 3), on the surface, metres. Methods that keep more of a start extend it."""
+        self._surface, self._variance = nodes, None
 
     @abstractmethod
     def _fit(self, points: FloatArray, weights: FloatArray, nodes: FloatArray, frame: Frame) -> Fit:
@@ -204,17 +203,15 @@ class NodeTracker(ABC):
         return [f"the start is doubtful: {reason}" for reason in estimate.reasons]
 
     def _start_from(self, axis: FloatArray) -> None:
-        self._surface = axis - self._depth_of_axis(axis)
         self._length = float(arc_lengths(axis)[-1])
         self._strides = np.maximum(_steps(axis), SHORTEST_STEP)
-        self._begin(self._surface)
+        self._begin(axis - self._depth_of_axis(axis))
 
     def _lose(self, frame: Frame, reason: str, count: int) -> Estimate:
         self._losses += 1
+        self._variance = None
         if self._losses >= RESTART_AFTER:
             self._surface = None
-        elif self._surface is not None:
-            self._widen()
         return Estimate.lost(frame.stamp_ns, reason, count)
 
     def _judge(self, fit: Fit, points: FloatArray, weights: FloatArray) -> tuple[list[str], bool]:

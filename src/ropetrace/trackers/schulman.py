@@ -6,6 +6,7 @@ links of a simulated rope; what it asks of them acts as impulses in the simulati
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -30,7 +31,6 @@ from ropetrace.trackers.clouds import (
 )
 from ropetrace.trackers.doubts import Doubts, strands_overlap
 from ropetrace.trackers.schulman_em import maximise, responsibilities
-from ropetrace.trackers.schulman_settings import SWINGING, SchulmanSettings
 from ropetrace.trackers.slicing import SlicingTracker
 from ropetrace.trackers.visibility import depth_behind
 from ropetrace.types import (
@@ -44,8 +44,6 @@ from ropetrace.types import (
     Waypoints,
     colors_of,
 )
-
-__all__ = ["SWINGING", "SchulmanSettings", "SchulmanTracker"]
 
 _REACH = 10.0
 """Points farther from the rope than this, in deviations of the prior, are outliers beyond doubt."""
@@ -85,22 +83,20 @@ class SchulmanTracker:
     Parameters
     ----------
     config : RopeConfig
-        Settings of the rope, as for every tracker. Gravity acts downwards in the world if `camera_pose` is given, and
-        else downwards in the image.
+        Settings; those of `config.schulman` are the method's. Gravity acts downwards in the world if `camera_pose` is
+        given, and else downwards in the image.
     mask : array or callable, optional
         Replaces the colour gate; the position box still holds.
     nodes : (M, 3) float array, optional
         The first shape, in order along the rope from tip to tip, metres, camera frame; by default the slicing
         tracker's first centreline.
-    settings : SchulmanSettings, optional
-        Parameters of the method.
-    clock : callable, optional
-        Seconds; must be given with `SchulmanSettings.budget`, such as ``time.perf_counter``.
+    clock : callable
+        Seconds, by which `budget` is kept; without a budget it is never asked.
 
     Raises
     ------
     ConfigError
-        If the nodes are no path, or there is a budget and no clock.
+        If the nodes are no path.
     MissingExtraError
         If MuJoCo is not installed.
     """
@@ -110,13 +106,10 @@ class SchulmanTracker:
         config: RopeConfig,
         mask: Mask | None = None,
         nodes: FloatArray | None = None,
-        settings: SchulmanSettings | None = None,
-        clock: Callable[[], float] | None = None,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.config = config.resolved()
-        self.settings = settings or SchulmanSettings()
-        if self.settings.budget is not None and clock is None:
-            raise ConfigError("a budget is measured by a clock: give one, such as time.perf_counter")
+        self.settings = config.schulman
         import_extra("mujoco", "sim")
         self._clock = clock
         self._given = None if nodes is None else _checked_path(nodes)
@@ -154,7 +147,7 @@ class SchulmanTracker:
         FrameError
             If colour is asked for and the frame has none, or the mask does not fit the frame.
         """
-        started = 0.0 if self._clock is None else self._clock()
+        started = 0.0 if self.settings.budget is None else self._clock()
         if isinstance(frame, BadFrame):
             self._points = np.empty((3, 0))
             return self._lost(frame, frame.reason, 0)
@@ -278,7 +271,7 @@ class SchulmanTracker:
                 return False
             means[:, :3] = chain.centres
             done += 1
-            if self._clock is None or settings.budget is None:
+            if settings.budget is None:
                 if done == settings.iterations:
                     return True
                 continue

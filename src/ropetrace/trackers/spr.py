@@ -36,12 +36,6 @@ class SprTracker(NodeTracker):
     def __init__(self, config: RopeConfig, mask: Mask | None = None, nodes: FloatArray | None = None) -> None:
         super().__init__(config, config.spr.nodes, config.spr.voxel, mask, nodes)
 
-    def _begin(self, nodes: FloatArray) -> None:
-        """Nothing but the nodes is kept."""
-
-    def _widen(self) -> None:
-        """Every frame is looked at as widely as the first."""
-
     def _fit(self, points: FloatArray, weights: FloatArray, nodes: FloatArray, frame: Frame) -> Fit:
         settings = self.config.spr
         scale = cloud_scale(points, weights)

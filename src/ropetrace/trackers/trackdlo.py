@@ -53,12 +53,9 @@ class TrackDloTracker(NodeTracker):
         super().__init__(config, config.trackdlo.nodes, config.trackdlo.voxel, mask, nodes)
 
     def _begin(self, nodes: FloatArray) -> None:
+        super()._begin(nodes)
         self._arc = arc_lengths(nodes)
         self._kernel = geodesic_kernel(self._arc, self.config.trackdlo.beta)
-        self._variance: float | None = None
-
-    def _widen(self) -> None:
-        self._variance = None
 
     def _fit(self, points: FloatArray, weights: FloatArray, nodes: FloatArray, frame: Frame) -> Fit:
         settings = self.config.trackdlo
@@ -106,7 +103,6 @@ class TrackDloTracker(NodeTracker):
             max_iterations=settings.max_iterations,
             tolerance=settings.tolerance,
         )
-        self._variance = fit.variance
         return replace(fit, hidden=len(nodes) - len(visible))
 
 
