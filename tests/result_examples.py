@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -51,6 +53,13 @@ def estimate(index: int) -> Estimate:
 def estimates(count: int) -> list[Estimate]:
     """The estimates of a run."""
     return [estimate(index) for index in range(count)]
+
+
+def told(index: int, rope: int = 0) -> Estimate:
+    """The estimate with a hidden middle and a standard deviation that grows towards it."""
+    item = dataclasses.replace(estimate(index), rope=rope)
+    places = np.linspace(-1, 1, len(item.waypoints))
+    return dataclasses.replace(item, seen=abs(places) > 0.3, position_sigma=0.001 + 0.02 * (1 - abs(places)))
 
 
 def frame(index: int, width: int = 64, height: int = 48, color: bool = True) -> RgbdFrame:

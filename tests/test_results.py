@@ -26,10 +26,18 @@ from rerun.chunk import RrdReader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from result_examples import FIRST_STAMP, REASONS, cloud, estimate, estimates, frame, helix, motion
+from result_examples import FIRST_STAMP, REASONS, cloud, estimate, estimates, frame, helix, motion, told
 from ropetrace.errors import MissingExtraError, OutputError
 from ropetrace.results import FORMATS, checkpoint, open_writer
-from ropetrace.results.base import COLUMNS, FLOAT_COLUMNS, MOTION_ARRAYS, float_rows, motion_rows, uninterrupted
+from ropetrace.results.base import (
+    COLUMNS,
+    FLOAT_COLUMNS,
+    MOTION_ARRAYS,
+    TRACKER_COLUMNS,
+    float_rows,
+    motion_rows,
+    uninterrupted,
+)
 from ropetrace.types import Estimate, Motion, Status
 
 ENDINGS = list(FORMATS)
@@ -50,13 +58,18 @@ def record(path: Path, items: list[Estimate], **options: Any) -> None:
             writer.write(10 + index, item)
 
 
+def two_ropes() -> list[Estimate]:
+    """A lost one among them, and for one in three the tracker tells nothing of the waypoints."""
+    return [dataclasses.replace(estimate(k), rope=k % 2) if k % 3 == 2 else told(k, k % 2) for k in range(10)]
+
+
 def expected_rows(items: list[Estimate]) -> list[tuple[Any, ...]]:
     rows: list[tuple[Any, ...]] = []
     for index, item in enumerate(items):
         waypoints, moving = item.waypoints, item.motion
         start, status = (10 + index, item.stamp_ns, item.ahead_ns), str(item.status)
         if not len(waypoints):
-            rows.append((*start, None, status, *[None] * len(FLOAT_COLUMNS)))
+            rows.append((*start, None, status, *[None] * len(FLOAT_COLUMNS), item.rope, None, None))
         for number in range(len(waypoints)):
             row: list[Any] = [
                 waypoints.arc_length[number],
@@ -69,7 +82,9 @@ def expected_rows(items: list[Estimate]) -> list[tuple[Any, ...]]:
                 row += [*moving.velocities[number], *moving.accelerations[number]]
                 row += [*moving.position_sigma[number], *moving.velocity_sigma[number]]
                 row += [*moving.acceleration_sigma[number]]
-            rows.append((*start, number, status, *row))
+            seen = None if item.seen is None else item.seen[number]
+            sigma = None if item.position_sigma is None else item.position_sigma[number]
+            rows.append((*start, number, status, *row, item.rope, seen, sigma))
     return rows
 
 
@@ -125,26 +140,28 @@ def frames_in(path: Path, finished: bool = True) -> list[int]:
     return sorted(rrd_frames(path))
 
 
-def test_csv_is_exact(tmp_path: Path) -> None:
-    items = estimates(10)
+@pytest.mark.parametrize("items", [estimates(10), two_ropes()], ids=["one rope", "two ropes"])
+def test_csv_is_exact(tmp_path: Path, items: list[Estimate]) -> None:
     record(tmp_path / "run.csv", items, metadata=METADATA)
     text = (tmp_path / "run.csv").read_bytes().decode()
     assert "\r" not in text
     header, *rows = csv.reader(text.splitlines())
     assert ",".join(header) == (
         "frame,stamp_ns,ahead_ns,waypoint,status,arc_length,x,y,z,qx,qy,qz,qw,vx,vy,vz,ax,ay,az,"
-        "sigma_x,sigma_y,sigma_z,sigma_vx,sigma_vy,sigma_vz,sigma_ax,sigma_ay,sigma_az"
+        "sigma_x,sigma_y,sigma_z,sigma_vx,sigma_vy,sigma_vz,sigma_ax,sigma_ay,sigma_az,"
+        "rope,seen,tracker_sigma"
     )
-    kinds = (int, int, int, int, str, *[float] * 23)
+    kinds = (int, int, int, int, str, *[float] * 23, int, int, float)
     read = [tuple(kind(cell) if cell else None for kind, cell in zip(kinds, row, strict=True)) for row in rows]
     assert read == expected_rows(items)
 
 
-def test_parquet_is_exact(tmp_path: Path) -> None:
-    items = estimates(10)
+@pytest.mark.parametrize("items", [estimates(10), two_ropes()], ids=["one rope", "two ropes"])
+def test_parquet_is_exact(tmp_path: Path, items: list[Estimate]) -> None:
     record(tmp_path / "run.parquet", items, frame_name="world", metadata=METADATA)
     table = pyarrow.parquet.read_table(tmp_path / "run.parquet")
     assert tuple(table.column_names) == COLUMNS
+    assert [str(table.schema.field(name).type) for name in TRACKER_COLUMNS] == ["int32", "bool", "double"]
     assert [tuple(row.values()) for row in table.to_pylist()] == expected_rows(items)
     kept = {key.decode(): value.decode() for key, value in table.schema.metadata.items()}
     assert kept == {**METADATA, "frame_name": "world"}
@@ -182,8 +199,8 @@ def test_the_motion_is_one_block_for_all_formats() -> None:
     assert (float_rows(known).shape, float_rows(lost).shape) == ((50, 23), (0, 23))
 
 
-def test_npz_is_exact(tmp_path: Path) -> None:
-    items = estimates(10)
+@pytest.mark.parametrize("items", [estimates(10), two_ropes()], ids=["one rope", "two ropes"])
+def test_npz_is_exact(tmp_path: Path, items: list[Estimate]) -> None:
     record(tmp_path / "run.npz", items, metadata=METADATA)
     with np.load(tmp_path / "run.npz", allow_pickle=False) as arrays:
         read = dict(arrays)
@@ -203,7 +220,11 @@ def test_npz_is_exact(tmp_path: Path) -> None:
         for name in MOTION_ARRAYS:
             expected = np.full((len(item.waypoints), 3), np.nan) if item.motion is None else getattr(item.motion, name)
             assert np.array_equal(read[name][part], expected, equal_nan=True)
-    assert {len(read[name]) for name in ("positions", *MOTION_ARRAYS)} == {waypoints[-1]}
+        unknown = np.full(len(item.waypoints), np.nan)
+        for name, values in (("seen", item.seen), ("tracker_sigma", item.position_sigma)):
+            assert np.array_equal(read[name][part], unknown if values is None else values, equal_nan=True)
+    assert read["rope"].tolist() == [item.rope for item in items]
+    assert {len(read[name]) for name in ("positions", *MOTION_ARRAYS, "seen", "tracker_sigma")} == {waypoints[-1]}
     assert json.loads(str(read["metadata"])) == {**METADATA, "frame_name": "camera"}
 
 
@@ -233,6 +254,7 @@ def test_mcap_is_read_by_rosbags(tmp_path: Path, frame_name: str, frame_id: str)
         assert (values["point_count"], values["nodes"]) == (str(item.point_count), str(len(item.nodes)))
         assert float(values["length"]) == item.waypoints.length
         assert float(values["ahead"]) == item.ahead_ns / 1e9
+        assert (status.name, values["rope"]) == ("ropetrace", "0")
     assert read["status"][3].status[0].message == "; ".join(REASONS)
 
 
@@ -261,6 +283,55 @@ def test_mcap_has_the_motion_of_every_waypoint(tmp_path: Path) -> None:
         assert rows([twist.linear for twist in point.accelerations]) == item.motion.accelerations.tolist()
         assert not np.any(rows([twist.angular for twist in point.velocities + point.accelerations]))
     assert [item.motion is None for item in items] == [True, False, False, False, True]
+
+
+def test_mcap_has_what_the_tracker_tells_of_each_waypoint(tmp_path: Path) -> None:
+    """From the first time that it tells something on, so that no picture of it outlives its frame."""
+    items = [estimate(0), told(1), dataclasses.replace(told(2), seen=None), told(4), estimate(5)]
+    record(tmp_path / "run.mcap", items)
+    with AnyReader([tmp_path / "run.mcap"]) as reader:
+        connections = [c for c in reader.connections if c.topic == "/ropetrace/waypoints"]
+        clouds: list[Any] = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(connections)]
+    kinds = {2: "u1", 7: "<f4", 8: "<f8"}
+    for item, message in zip(items[1:], clouds, strict=True):
+        assert nanoseconds(message.header.stamp) == item.stamp_ns + item.ahead_ns
+        columns = {field.name: (kinds[field.datatype], field.offset) for field in message.fields}
+        layout: Any = {
+            "names": list(columns),
+            "formats": [kind for kind, _ in columns.values()],
+            "offsets": [offset for _, offset in columns.values()],
+            "itemsize": message.point_step,
+        }
+        rows: Any = np.frombuffer(message.data.tobytes(), np.dtype(layout))
+        assert (message.height, message.width, message.row_step) == (1, len(rows), message.data.size)
+        places = np.column_stack([rows[axis] for axis in "xyz"])
+        assert np.array_equal(places, item.waypoints.positions.astype(np.float32))
+        for name, values in (("seen", item.seen), ("tracker_sigma", item.position_sigma)):
+            assert (name in columns) == (values is not None)
+            assert values is None or np.array_equal(rows[name], values)
+
+
+def test_each_rope_has_topics_of_its_own_in_an_mcap(tmp_path: Path) -> None:
+    items = two_ropes()
+    with open_writer(tmp_path / "run.mcap") as writer:
+        for number, item in enumerate(items):
+            writer.write(number // 2, item)
+    with (tmp_path / "run.mcap").open("rb") as file:
+        messages = [
+            (channel.topic.removeprefix("/ropetrace/"), message.sequence, message.log_time)
+            for _, channel, message in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False)
+        ]
+    for rope, start in ((0, ""), (1, "rope_1/")):
+        stamps = [(number, item.stamp_ns) for number, item in enumerate(items[rope::2])]
+        for topic in ("centerline", "motion", "status", "waypoints"):
+            assert [rest for name, *rest in messages if name == start + topic] == [[*pair] for pair in stamps]
+    with AnyReader([tmp_path / "run.mcap"]) as reader:
+        connections = [c for c in reader.connections if c.topic == "/ropetrace/rope_1/status"]
+        states: list[Any] = [
+            reader.deserialize(data, c.msgtype).status[0] for c, _, data in reader.messages(connections)
+        ]
+    assert {state.name for state in states} == {"ropetrace: rope_1"}
+    assert {pair.value for state in states for pair in state.values if pair.key == "rope"} == {"1"}
 
 
 def test_mcap_has_checksums_schemas_and_metadata(tmp_path: Path) -> None:

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from helpers import RED_TEXT, SHAPES, SMALL, random_rotation, seen
 from ropetrace.config import RopeConfig
-from ropetrace.errors import OutputError
+from ropetrace.errors import FrameError, OutputError
 from ropetrace.motion.arc_length import ArcLengthMotion
 from ropetrace.trackers import SlicingTracker
+from ropetrace.trackers.base import Lap, no_lap
 from ropetrace.tracking import Summary, ahead_of_time, in_world, track_recording, with_motion
 from ropetrace.types import BadFrame, Cloud, Estimate, Event, FloatArray, Frame, Motion, RgbdFrame, Status, Waypoints
 
@@ -61,7 +62,7 @@ def test_every_event_has_its_row_in_order() -> None:
     assert "frame has none" in keeper.rows[2][1].reasons[0]
     assert [frame for _, _, frame, _ in keeper.rows] == [events[0], None, events[2], events[3]]
     assert (summary.frames, summary.found, summary.interrupted) == (4, 2, False)
-    assert summary.statuses == {Status.OK: 2, Status.LOST: 2}
+    assert summary.ropes[0].statuses == {Status.OK: 2, Status.LOST: 2}
 
 
 def test_each_frame_goes_to_all_sinks_before_the_next() -> None:
@@ -203,6 +204,110 @@ def test_a_lost_estimate_stays_lost_in_the_world() -> None:
     assert (lost.status, lost.reasons, lost.nodes.shape, lost.point_count) == (Status.LOST, ("why",), (0, 3), 5)
 
 
+def test_what_the_tracker_tells_of_the_waypoints_passes_all_steps() -> None:
+    waypoints = Waypoints(np.eye(3), np.tile([0.0, 0, 0, 1], (3, 1)), np.arange(3.0))
+    seen, sigma, motion = np.array([True, False, True]), np.array([0.001, 0.02, 0.0]), Recorder()
+    estimate = Estimate(1, Status.OK, waypoints=waypoints, seen=seen, position_sigma=sigma, rope=4)
+    estimate = with_motion(with_motion(estimate, motion), motion)
+    estimate = in_world(ahead_of_time(estimate, motion, 0.1), np.diag([-1.0, -1, 1, 1]))
+    assert (estimate.ahead_ns, estimate.rope) == (100_000_000, 4)
+    np.testing.assert_array_equal(estimate.waypoints.positions[0], [-1.1, 0, 0])
+    assert estimate.seen is seen
+    assert estimate.position_sigma is sigma
+
+
+# --- several ropes ---
+
+
+class Pair:
+    """A tracker of two ropes, the second as far down as its stamp in metres; it finds no second rope at first."""
+
+    def update(self, frame: Frame | BadFrame, lap: Lap = no_lap) -> Estimate:
+        return self.update_all(frame, lap)[0]
+
+    def update_all(self, frame: Frame | BadFrame, lap: Lap = no_lap) -> tuple[Estimate, ...]:
+        if isinstance(frame, BadFrame):
+            raise FrameError(frame.reason)
+        stamp = frame.stamp_ns
+        first = Estimate(stamp, Status.OK, waypoints=self._straight(0), point_count=7)
+        if stamp == 1:
+            return (first,)
+        return first, Estimate(stamp, Status.DEGRADED, ("a part is hidden",), waypoints=self._straight(stamp), rope=1)
+
+    def cloud(self) -> Cloud:
+        return Cloud(np.ones((5, 3)), np.zeros(5, np.int32))
+
+    def reset(self) -> None:
+        raise NotImplementedError
+
+    def _straight(self, down: float) -> Waypoints:
+        places = np.array([[0.0, down, 1], [0.5, down, 1]])
+        return Waypoints(places, np.tile([0.0, 0, 0, 1], (2, 1)), np.array([0.0, 0.5]))
+
+
+def test_each_rope_is_handed_on_with_a_motion_of_its_own() -> None:
+    log: list[str] = []
+    first, second = Keeper(log, "a"), Keeper(log, "b")
+    motions = [Recorder(), Recorder()]
+    made = iter(motions)
+    told: list[Estimate] = []
+    summary = track_recording(
+        [good(1), good(2), good(3)],
+        Pair(),
+        [first, second],
+        motion=lambda: next(made),
+        predict=0.5,
+        wants_cloud=True,
+        on_frame=told.append,
+    )
+    assert log == ["a0", "b0", "a1", "a1", "b1", "b1", "a2", "a2", "b2", "b2"]
+    assert [(estimate.stamp_ns, estimate.rope) for _, estimate, *_ in first.rows] == [
+        (1, 0),
+        (2, 0),
+        (2, 1),
+        (3, 0),
+        (3, 1),
+    ]
+    assert [motion.told for motion in motions] == [[1, 2, 3], [2, 3]]
+    assert [estimate.motion is not None for _, estimate, *_ in first.rows] == [False, True, False, True, True]
+    np.testing.assert_array_equal(first.rows[4][1].waypoints.positions, [[0.5, 3, 1], [1.0, 3, 1]])
+    assert first.rows[3][3] is first.rows[4][3]
+    assert [estimate.rope for estimate in told] == [0, 0, 0]
+    assert (summary.frames, summary.found) == (3, 5)
+    lines = summary.lines()
+    assert lines[:5] == [
+        "frames    3",
+        "rope 0    3 ok, 0 degraded, 0 lost",
+        "points    7 a frame (median)",
+        "nodes     0 a frame (median)",
+        "length    0.500 m (median), 0.500 to 0.500 m",
+    ]
+    assert lines[5:7] == ["rope 1    0 ok, 2 degraded, 0 lost", "          2 x a part is hidden"]
+
+
+def test_a_frame_that_cannot_be_used_is_lost_for_every_rope() -> None:
+    keeper = Keeper()
+    track_recording([BadFrame(1, "x"), good(2), BadFrame(3, "y")], Pair(), [keeper])
+    assert [(estimate.rope, str(estimate.status), estimate.reasons) for _, estimate, *_ in keeper.rows] == [
+        (0, "lost", ("x",)),
+        (0, "ok", ()),
+        (1, "degraded", ("a part is hidden",)),
+        (0, "lost", ("y",)),
+        (1, "lost", ("y",)),
+    ]
+
+
+def test_one_estimator_of_motion_does_not_serve_two_ropes() -> None:
+    with pytest.raises(ValueError, match="rope 1 needs an estimator of motion of its own"):
+        track_recording([good(2)], Pair(), motion=Recorder())
+
+
+def test_ropes_may_have_no_motion() -> None:
+    keeper = Keeper()
+    track_recording([good(2)], Pair(), [keeper], motion=lambda: None, predict=0.5)
+    assert [(estimate.motion, estimate.ahead_ns) for _, estimate, *_ in keeper.rows] == [(None, 0), (None, 0)]
+
+
 # --- motion ---
 
 
@@ -323,7 +428,7 @@ def test_the_summary_counts_like_reasons_together() -> None:
     for index in range(3):
         summary.add(Estimate.lost(index, f"too few points ({index})"))
     summary.add(Estimate.lost(9, "something else"))
-    assert summary.reasons.most_common(1) == [("too few points #", 3)]
+    assert summary.ropes[0].reasons.most_common(1) == [("too few points #", 3)]
     lines = summary.lines()
     assert lines[0] == "frames    4 (0 ok, 0 degraded, 4 lost)"
     assert lines[1].endswith("3 x too few points #")

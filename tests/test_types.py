@@ -157,6 +157,27 @@ def test_a_motion_of_other_shapes_is_refused() -> None:
         Estimate(0, Status.OK, motion=Motion(rows, rows, rows, rows, rows))
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seen": np.ones(3, bool)}, r"seen is bool of shape \(3,\): expected bool of shape \(4,\)"),
+        ({"seen": np.ones(4)}, "seen is float64"),
+        ({"position_sigma": np.ones((4, 3))}, r"position_sigma is float64 of shape \(4, 3\): expected .* \(4,\)"),
+        ({"position_sigma": np.ones(4, np.float32)}, "position_sigma is float32"),
+        ({"position_sigma": np.array([0.0, 1, -1e-9, 1])}, "a position_sigma is negative or not a finite number"),
+        ({"position_sigma": np.array([0.0, 1, math.nan, 1])}, "a position_sigma is negative or not a finite number"),
+        ({"position_sigma": np.array([0.0, 1, math.inf, 1])}, "a position_sigma is negative or not a finite number"),
+        ({"rope": -1}, "rope = -1 is negative"),
+    ],
+)
+def test_what_a_tracker_tells_of_the_waypoints_fits_them(change: dict[str, Any], message: str) -> None:
+    waypoints = Waypoints(np.zeros((4, 3)), np.zeros((4, 4)), np.zeros(4))
+    whole = Estimate(0, Status.OK, waypoints=waypoints, seen=np.ones(4, bool), position_sigma=np.zeros(4), rope=2)
+    assert (whole.rope, Estimate.lost(0, "x").rope, Estimate.lost(0, "x", rope=2).rope) == (2, 0, 2)
+    with pytest.raises(ValueError, match=f"estimate: {message}"):
+        dataclasses.replace(whole, **change)
+
+
 def test_a_motion_in_another_frame() -> None:
     """Its sigmas are the square roots of the diagonals of covariances that turn."""
     rng = np.random.default_rng(0)

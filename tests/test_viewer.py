@@ -15,7 +15,7 @@ import pytest
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
-from result_examples import FIRST_STAMP, REASONS, cloud, estimate, frame, helix, motion
+from result_examples import FIRST_STAMP, REASONS, cloud, estimate, frame, helix, motion, told
 from ropetrace.errors import OutputError
 from ropetrace.results import live, open_writer
 from ropetrace.results.live import LiveViewer
@@ -30,6 +30,7 @@ from ropetrace.viewer import (
     VELOCITY_COLOR,
     VELOCITY_SECONDS,
     ArmView,
+    rope_color,
 )
 
 Rows = dict[str, dict[int | None, dict[str, Any]]]
@@ -114,6 +115,76 @@ def test_a_lost_frame_clears_the_rope(path: Path) -> None:
     # What was segmented is what one wants to see then.
     assert 4 in rows["/rope/cloud"]
     assert rows["/plots/length"][4]["Scalars:scalars"] == [0.0]
+
+
+def test_seen_and_hidden_parts_are_apart(path: Path) -> None:
+    """Hidden: the waypoints 18 to 31 of 50, with a step to the seen one at either side."""
+    item = told(1)
+    rows = logged(path, (item, None, None))
+    strips = [np.array(strip) for strip in rows["/rope/centerline"][0]["LineStrips3D:strips"]]
+    places = item.waypoints.positions
+    assert item.seen is not None
+    assert np.flatnonzero(~item.seen).tolist() == list(range(18, 32))
+    for strip, expected in zip(strips, (places[:18], places[32:]), strict=True):
+        np.testing.assert_allclose(strip, expected, atol=1e-6)
+    (hidden,) = rows["/rope/hidden"][0]["LineStrips3D:strips"]
+    np.testing.assert_allclose(hidden, places[17:33], atol=1e-6)
+    assert rgb(rows["/rope/centerline"][0]["LineStrips3D:colors"]) == [tuple(rope_color(0))]
+
+
+def test_rings_are_as_wide_as_the_trackers_sigma_across_the_hidden_part(path: Path) -> None:
+    item = told(1)
+    rows = logged(path, (item, None, None))
+    rings = np.array(rows["/rope/sigma"][0]["LineStrips3D:strips"])
+    assert item.seen is not None
+    assert item.position_sigma is not None
+    spokes = rings - item.waypoints.positions[~item.seen, None]
+    radii = np.linalg.norm(spokes, axis=2)
+    np.testing.assert_allclose(radii, np.tile(item.position_sigma[~item.seen, None], radii.shape[1]), atol=1e-6)
+    along = Rotation.from_quat(item.waypoints.quaternions[~item.seen]).apply([1, 0, 0])
+    np.testing.assert_allclose(np.einsum("kcd,kd->kc", spokes, along), 0, atol=1e-6)
+    np.testing.assert_allclose(rings[:, 0], rings[:, -1], atol=1e-6)
+
+
+def test_where_the_tracker_does_not_tell_all_is_the_centreline(path: Path) -> None:
+    seen = np.ones(50, bool)
+    silent, whole = estimate(1), dataclasses.replace(told(2), seen=seen)
+    hidden, unsure = dataclasses.replace(told(3), seen=~seen), dataclasses.replace(told(5), seen=None)
+    rows = logged(path, *((item, None, None) for item in (silent, whole, hidden, unsure)))
+    assert set(rows["/rope/centerline"]) == {0, 1, 3}
+    assert set(rows["/rope/hidden"]) == {2}
+    assert {index: len(row["LineStrips3D:strips"]) for index, row in rows["/rope/sigma"].items()} == {2: 50, 3: 50}
+
+
+def test_each_rope_has_its_own_entities_name_and_colour(path: Path) -> None:
+    ropes = [(0, told(0)), (0, told(3, 1)), (1, told(1)), (2, told(2)), (2, told(2, 1))]
+    with open_writer(path) as writer:
+        for index, item in ropes:
+            writer.write(index, item, frame(index), cloud(index))
+    rows = read_back(path)
+    assert set(rows["/rope/centerline"]) == {0, 1, 2}
+    assert set(rows["/rope_1/centerline"]) == set(rows["/rope_1/hidden"]) == {0, 2}
+    # The second rope is not in frame 1: what there was of it goes.
+    assert rows["/rope_1"][1]["Clear:is_recursive"] == [True]
+    assert rows["/rope/name"][0]["Points3D:labels"] == ["rope 0"]
+    assert rows["/rope_1/name"][0]["Points3D:labels"] == ["rope 1: degraded"]
+    assert rows["/rope_1/name"][2]["Points3D:labels"] == ["rope 1"]
+    assert rgb(rows["/rope_1/centerline"][0]["LineStrips3D:colors"]) == [tuple(rope_color(1))]
+    assert tuple(rope_color(0)) != tuple(rope_color(1))
+    assert rows["/plots/length/rope_1"][2]["Scalars:scalars"] == [told(2).waypoints.length]
+    assert rows["/plots/length/rope_1"][None]["SeriesLines:names"] == ["rope 1"]
+    assert rows["/plots/length"][None]["SeriesLines:names"] == ["rope 0"]
+    assert rows["/status/rope_1"][0]["TextLog:text"] == [f"rope 1: degraded: {'; '.join(REASONS)}"]
+    assert rows["/status/rope_1"][2]["TextLog:text"] == ["rope 1: ok"]
+
+
+def test_the_images_of_a_frame_are_logged_once(path: Path) -> None:
+    with open_writer(path) as writer:
+        for rope in range(3):
+            writer.write(0, told(0, rope), frame(0), cloud(0))
+    chunks = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == "/camera/image"]
+    assert sum(chunk.num_rows for chunk in chunks) == 1
+    assert {"/rope/cloud", "/rope/centerline", "/rope_1/centerline", "/rope_2/centerline"} <= set(read_back(path))
 
 
 def test_arrows_point_where_the_rope_moves(path: Path) -> None:
@@ -309,6 +380,24 @@ def test_the_viewer_never_slows_the_tracker(viewer: LiveViewer, monkeypatch: pyt
     assert shown == sorted(shown)
     assert len(shown) + viewer.skipped == 50
     assert not viewer.running
+
+
+def test_the_ropes_of_a_frame_are_shown_together(viewer: LiveViewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = []
+
+    def slow(index: int, item: Estimate, *_: Any) -> None:
+        time.sleep(0.05)
+        shown.append((index, item.rope))
+
+    monkeypatch.setattr(viewer._log, "log", slow)
+    for index in range(10):
+        for rope in range(2):
+            viewer.write(index, told(index, rope))
+        time.sleep(0.01)
+    viewer.close(keep_window=False)
+    assert shown[-2:] == [(9, 0), (9, 1)]
+    assert viewer.skipped > 0
+    assert shown == sorted(shown)
 
 
 def test_the_viewer_listens_to_this_machine_only(viewer: LiveViewer) -> None:

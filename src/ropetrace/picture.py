@@ -15,7 +15,12 @@ from ropetrace.types import Cloud, CloudFrame, Estimate, FloatArray, Frame, Intr
 TILE_WIDTH = 640
 """Width of one frame on a sheet, pixels."""
 
-_LINE = (255, 200, 0)
+_LINES = ((255, 200, 0), (90, 190, 255), (255, 120, 220), (170, 240, 90))
+"""Colours of the centrelines of the first rope, the second, ..., in turn."""
+
+_NEAREST = 1e-6
+"""What is not this far before the camera is not drawn, metres."""
+
 _NODE = (60, 220, 90)
 _START = (80, 160, 255)
 _STATUS_COLORS = {Status.OK: (150, 230, 160), Status.DEGRADED: (255, 190, 90), Status.LOST: (255, 110, 110)}
@@ -38,20 +43,31 @@ def overlay(frame: Frame, estimate: Estimate, cloud: Cloud | None = None, title:
     Depth is shown where the frame has no colour. A point cloud is shown as its camera would see it.
     """
     picture, camera = backdrop(frame, cloud)
-    zoom = TILE_WIDTH / picture.width
     said = f"{estimate.status}  {estimate.waypoints.length:.3f} m  {len(estimate.nodes)} nodes"
     if estimate.reasons:
         said += f"\n{estimate.reasons[0][:90]}"
     picture = captioned(picture, title, said, _STATUS_COLORS[estimate.status])
-    draw = ImageDraw.Draw(picture)
-    line = pixels_of(estimate.waypoints.positions, camera) * zoom
-    if len(line) > 1:
-        draw.line([tuple(pixel) for pixel in line.tolist()], fill=_LINE, width=2)
-        for u, v in pixels_of(estimate.nodes, camera) * zoom:
-            draw.ellipse((u - 2, v - 2, u + 2, v + 2), fill=_NODE)
-        u, v = line[0]
-        draw.ellipse((u - 6, v - 6, u + 6, v + 6), outline=_START, width=2)
+    _draw_rope(picture, camera, estimate)
     return picture
+
+
+def _draw_rope(picture: Image.Image, camera: Intrinsics, estimate: Estimate) -> None:
+    """The centreline, thin where it is hidden, and the nodes; the camera is that of the picture at its own size."""
+    zoom = picture.width / camera.width
+    draw = ImageDraw.Draw(picture)
+    color = _LINES[estimate.rope % len(_LINES)]
+    ahead = estimate.waypoints.positions[:, 2] > _NEAREST
+    seen = np.ones(len(ahead), bool) if estimate.seen is None else estimate.seen
+    line = pixels_of(estimate.waypoints.positions, camera) * zoom
+    if len(line) < 2:
+        return
+    steps = seen[ahead][:-1] & seen[ahead][1:]
+    for start, end, whole in zip(line[:-1].tolist(), line[1:].tolist(), steps, strict=True):
+        draw.line([tuple(start), tuple(end)], fill=color, width=2 if whole else 1)
+    for u, v in pixels_of(estimate.nodes, camera) * zoom:
+        draw.ellipse((u - 2, v - 2, u + 2, v + 2), fill=_NODE)
+    u, v = line[0]
+    draw.ellipse((u - 6, v - 6, u + 6, v + 6), outline=_START, width=2)
 
 
 def backdrop(frame: Frame, cloud: Cloud | None = None) -> tuple[Image.Image, Intrinsics]:
@@ -113,18 +129,26 @@ class ContactSheet:
     _kept: list[Image.Image] = field(default_factory=list)
     _every: int = 1
     _seen: int = 0
+    _index: int | None = None
+    _latest: Image.Image | None = None
 
     def write(self, index: int, estimate: Estimate, frame: Frame | None, cloud: Cloud | None) -> None:
-        """Take one frame; bad frames are not shown."""
+        """Take one rope of a frame; bad frames are not shown."""
         if frame is None:
             return
+        if index == self._index:
+            if self._latest is not None:
+                _draw_rope(self._latest, backdrop(frame, cloud)[1], estimate)
+            return
+        self._index, self._latest = index, None
         if self._seen % self._every == 0:
             if len(self._kept) == 2 * self.most:
                 # Twice as many as needed: every second goes, and from now on half as many are taken.
                 self._kept = self._kept[::2]
                 self._every *= 2
             if self._seen % self._every == 0:
-                self._kept.append(overlay(frame, estimate, cloud, f"frame {index}"))
+                self._latest = overlay(frame, estimate, cloud, f"frame {index}")
+                self._kept.append(self._latest)
         self._seen += 1
 
     def save(self) -> bool:
@@ -138,7 +162,7 @@ class ContactSheet:
 
 def pixels_of(points: FloatArray, camera: Intrinsics) -> FloatArray:
     """Projections of (N, 3) points: columns and rows, (N, 2). Points behind the camera are left out."""
-    points = points[points[:, 2] > 1e-6]
+    points = points[points[:, 2] > _NEAREST]
     return np.stack(
         [
             points[:, 0] / points[:, 2] * camera.fx + camera.cx,
@@ -151,7 +175,7 @@ def pixels_of(points: FloatArray, camera: Intrinsics) -> FloatArray:
 def _camera_around(frame: CloudFrame, cloud: Cloud | None) -> Intrinsics:
     """A camera at the origin that sees the rope's points, or, without any, the whole cloud."""
     points = cloud.points if cloud is not None and len(cloud.points) else frame.points
-    points = points[np.isfinite(points).all(axis=1) & (points[:, 2] > 1e-6)]
+    points = points[np.isfinite(points).all(axis=1) & (points[:, 2] > _NEAREST)]
     if not len(points):
         return Intrinsics(640, 480, 500, 500, 319.5, 239.5)
     directions = points[:, :2] / points[:, 2:]
@@ -165,7 +189,7 @@ def _camera_around(frame: CloudFrame, cloud: Cloud | None) -> Intrinsics:
 def _splat(frame: CloudFrame, camera: Intrinsics) -> NDArray[np.uint8]:
     """The cloud's points as pixels."""
     image = np.full((camera.height, camera.width, 3), 15, np.uint8)
-    finite = np.isfinite(frame.points).all(axis=1) & (frame.points[:, 2] > 1e-6)
+    finite = np.isfinite(frame.points).all(axis=1) & (frame.points[:, 2] > _NEAREST)
     points = frame.points[finite].astype(float)
     columns, rows = np.round(pixels_of(points, camera)).astype(int).T
     inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)

@@ -6,7 +6,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from ropetrace.centerline import waypoints_through
 from ropetrace.errors import FrameError
 from ropetrace.motion import MotionEstimator
 from ropetrace.results.base import uninterrupted
-from ropetrace.trackers.base import Tracker
+from ropetrace.trackers.base import Lap, Tracker, no_lap
 from ropetrace.types import BadFrame, Cloud, Estimate, Event, FloatArray, Frame, Status, moved
 
 
@@ -22,25 +22,29 @@ class Sink(Protocol):
     """What takes the estimates of a run: a writer of results, the live viewer, a picture."""
 
     def write(self, index: int, estimate: Estimate, frame: Frame | None, cloud: Cloud | None) -> None:
-        """Take the estimate of one frame."""
+        """Take the estimate of one rope in one frame; those of a frame follow one another, with the same cloud."""
+
+
+@runtime_checkable
+class RopesTracker(Tracker, Protocol):
+    """A tracker that may follow several ropes."""
+
+    def update_all(self, frame: Frame | BadFrame, lap: Lap = no_lap) -> tuple[Estimate, ...]:
+        """As `update`, with an estimate for each rope: at least one, in the order of their `rope`."""
 
 
 @dataclass(slots=True)
-class Summary:
-    """What a run came to; prints itself."""
+class RopeSummary:
+    """What a run came to for one rope."""
 
-    frames: int = 0
     statuses: Counter[Status] = field(default_factory=Counter)
     reasons: Counter[str] = field(default_factory=Counter)
     points: list[int] = field(default_factory=list)
     nodes: list[int] = field(default_factory=list)
     lengths: list[float] = field(default_factory=list)
-    stage_seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    interrupted: bool = False
 
     def add(self, estimate: Estimate) -> None:
-        """Count one frame."""
-        self.frames += 1
+        """Count one estimate."""
         self.statuses[estimate.status] += 1
         self.reasons.update(_kind(reason) for reason in estimate.reasons)
         if estimate.status is not Status.LOST:
@@ -49,23 +53,52 @@ class Summary:
             self.lengths.append(estimate.waypoints.length)
 
     @property
-    def found(self) -> int:
-        """Frames with an estimate."""
-        return len(self.nodes)
+    def counts(self) -> str:
+        """The statuses for people."""
+        return ", ".join(f"{self.statuses[status]} {status}" for status in Status)
 
     def lines(self) -> list[str]:
-        """The summary for people."""
-        counts = ", ".join(f"{self.statuses[status]} {status}" for status in Status)
-        lines = [f"frames    {self.frames} ({counts})"]
-        for reason, count in self.reasons.most_common(5):
-            lines.append(f"          {count} x {reason}")
-        if self.found:
+        """The reasons and sizes for people."""
+        lines = [f"          {count} x {reason}" for reason, count in self.reasons.most_common(5)]
+        if self.nodes:
             lines += [
                 f"points    {np.median(self.points):.0f} a frame (median)",
                 f"nodes     {np.median(self.nodes):.0f} a frame (median)",
                 f"length    {np.median(self.lengths):.3f} m (median), "
                 f"{min(self.lengths):.3f} to {max(self.lengths):.3f} m",
             ]
+        return lines
+
+
+@dataclass(slots=True)
+class Summary:
+    """What a run came to; prints itself."""
+
+    frames: int = 0
+    ropes: dict[int, RopeSummary] = field(default_factory=lambda: defaultdict(RopeSummary))
+    stage_seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    interrupted: bool = False
+
+    def add(self, *estimates: Estimate) -> None:
+        """Count one frame, with the estimates of its ropes."""
+        self.frames += 1
+        for estimate in estimates:
+            self.ropes[estimate.rope].add(estimate)
+
+    @property
+    def found(self) -> int:
+        """Estimates that are not lost, of all ropes."""
+        return sum(len(rope.nodes) for rope in self.ropes.values())
+
+    def lines(self) -> list[str]:
+        """The summary for people."""
+        if len(self.ropes) > 1:
+            lines = [f"frames    {self.frames}"]
+            for number, rope in sorted(self.ropes.items()):
+                lines += [f"rope {number:<4d} {rope.counts}", *rope.lines()]
+        else:
+            rope = next(iter(self.ropes.values()), RopeSummary())
+            lines = [f"frames    {self.frames} ({rope.counts})", *rope.lines()]
         if self.stage_seconds:
             lines.append("time      stage            p50 ms   p99 ms")
             first = 0.0
@@ -91,7 +124,7 @@ def track_recording(
     tracker: Tracker,
     sinks: Iterable[Sink] = (),
     *,
-    motion: MotionEstimator | None = None,
+    motion: MotionEstimator | Callable[[], MotionEstimator | None] | None = None,
     predict: float | Literal["now"] = 0.0,
     first_index: int = 0,
     world_from_camera: FloatArray | None = None,
@@ -105,12 +138,13 @@ def track_recording(
     ----------
     frames : iterable
         Such as `Recording.frames`.
-    tracker : Tracker
+    tracker : Tracker or RopesTracker
         Takes them.
     sinks : iterable of Sink
         Each is given every estimate.
-    motion : MotionEstimator, optional
-        Gives the waypoints their velocities and accelerations.
+    motion : MotionEstimator or callable, optional
+        Gives the waypoints their velocities and accelerations. Where there are several ropes: what makes an estimator,
+        called once for each.
     predict : float or "now"
         Hand on the centreline of this many seconds after the frame's stamp, or, as if the frame came at its stamp, of
         the moment at which it is handed on: then the results depend on how fast this machine was.
@@ -121,7 +155,7 @@ def track_recording(
     wants_cloud : bool
         Whether the sinks are given the points and their nodes.
     on_frame : callable, optional
-        Told of each estimate, for a progress bar.
+        Told of the first estimate of each frame, for a progress bar.
     should_stop : callable
         Asked before each frame; the run then ends as if it was interrupted.
 
@@ -134,9 +168,12 @@ def track_recording(
     ------
     OutputError
         If a sink cannot write.
+    ValueError
+        If there are several ropes and `motion` is the estimator of one.
     """
     sinks = list(sinks)
     summary = Summary()
+    motions = _Motions(motion)
     iterator = iter(frames)
     index = first_index
     try:
@@ -149,15 +186,12 @@ def track_recording(
                 break
             watch.lap("read")
             came = time.perf_counter()
-            estimate = _estimate(event, tracker, watch)
+            estimates = _estimates(event, tracker, watch, sorted(summary.ropes) or [0])
             if motion is not None:
-                estimate = with_motion(estimate, motion)
-                if predict:
-                    ahead = time.perf_counter() - came if predict == "now" else predict
-                    estimate = ahead_of_time(estimate, motion, ahead)
+                estimates = tuple(_moving(estimate, motions.of(estimate.rope), predict, came) for estimate in estimates)
                 watch.lap("motion")
             if world_from_camera is not None:
-                estimate = in_world(estimate, world_from_camera)
+                estimates = tuple(in_world(estimate, world_from_camera) for estimate in estimates)
             cloud = tracker.cloud() if wants_cloud and not isinstance(event, BadFrame) else None
             if cloud is not None and world_from_camera is not None:
                 cloud = Cloud(moved(cloud.points, world_from_camera), cloud.node)
@@ -165,16 +199,44 @@ def track_recording(
             # A frame is in all results and in the summary, or in none.
             with uninterrupted():
                 for sink in sinks:
-                    sink.write(index, estimate, None if isinstance(event, BadFrame) else event, cloud)
-                summary.add(estimate)
+                    for estimate in estimates:
+                        sink.write(index, estimate, None if isinstance(event, BadFrame) else event, cloud)
+                summary.add(*estimates)
             if sinks:
                 watch.lap("write")
             if on_frame is not None:
-                on_frame(estimate)
+                on_frame(estimates[0])
             index += 1
     except KeyboardInterrupt:
         summary.interrupted = True
     return summary
+
+
+class _Motions:
+    """An estimator of motion for each rope: the one that is given, or what the given function makes."""
+
+    def __init__(self, motion: MotionEstimator | Callable[[], MotionEstimator | None] | None) -> None:
+        self._motion = motion
+        self._of_rope: dict[int, MotionEstimator | None] = {}
+
+    def of(self, rope: int) -> MotionEstimator | None:
+        if rope not in self._of_rope:
+            if not callable(self._motion) and self._of_rope:
+                raise ValueError(f"rope {rope} needs an estimator of motion of its own: give what makes one")
+            self._of_rope[rope] = self._motion() if callable(self._motion) else self._motion
+        return self._of_rope[rope]
+
+
+def _moving(
+    estimate: Estimate, motion: MotionEstimator | None, predict: float | Literal["now"], came: float
+) -> Estimate:
+    """The estimate with its motion, predicted if that is asked for; `came` is when its frame came, in seconds."""
+    if motion is None:
+        return estimate
+    estimate = with_motion(estimate, motion)
+    if not predict:
+        return estimate
+    return ahead_of_time(estimate, motion, time.perf_counter() - came if predict == "now" else predict)
 
 
 def with_motion(estimate: Estimate, motion: MotionEstimator) -> Estimate:
@@ -209,11 +271,14 @@ def in_world(estimate: Estimate, world_from_camera: FloatArray) -> Estimate:
     )
 
 
-def _estimate(event: Event, tracker: Tracker, watch: _Stopwatch) -> Estimate:
+def _estimates(event: Event, tracker: Tracker, watch: _Stopwatch, ropes: list[int]) -> tuple[Estimate, ...]:
+    """The estimate of each rope; `ropes` are those so far, all lost in a frame that cannot be used."""
     try:
-        return tracker.update(event, watch.lap)
+        if isinstance(tracker, RopesTracker):
+            return tracker.update_all(event, watch.lap)
+        return (tracker.update(event, watch.lap),)
     except FrameError as error:
-        return Estimate.lost(event.stamp_ns, str(error))
+        return tuple(Estimate.lost(event.stamp_ns, str(error), rope=rope) for rope in ropes)
 
 
 class _Stopwatch:

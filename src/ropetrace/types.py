@@ -311,6 +311,19 @@ class Estimate:
         Of the waypoints; None where it is not known, as in the first frame.
     ahead_ns : int
         The waypoints and their motion are predicted for this long after the stamp, nanoseconds; nodes never are.
+    seen : (W,) bool array, optional
+        Which waypoints the camera saw in this frame; None where the method does not tell.
+    position_sigma : (W,) float array, optional
+        Standard deviation of each waypoint's position, the same in all directions, metres, at the stamp, as the
+        tracker judges it; None where it does not tell. `Motion` has that of its filter.
+    rope : int
+        Which rope, 0 for the first.
+
+    Raises
+    ------
+    ValueError
+        If the arrays of a waypoint do not fit the waypoints, a `position_sigma` is no finite length, or `rope` is
+        negative.
     """
 
     stamp_ns: int
@@ -322,15 +335,34 @@ class Estimate:
     point_stride: int = 1
     motion: Motion | None = None
     ahead_ns: int = 0
+    seen: NDArray[np.bool_] | None = None
+    position_sigma: FloatArray | None = None
+    rope: int = 0
 
     def __post_init__(self) -> None:
-        if self.motion is not None and len(self.motion) != len(self.waypoints):
-            raise ValueError(f"estimate: {len(self.waypoints)} waypoints, but the motion of {len(self.motion)}")
+        count = len(self.waypoints)
+        if self.motion is not None and len(self.motion) != count:
+            raise ValueError(f"estimate: {count} waypoints, but the motion of {len(self.motion)}")
+        if self.seen is not None and (self.seen.shape != (count,) or self.seen.dtype != np.bool_):
+            raise ValueError(
+                f"estimate: seen is {self.seen.dtype} of shape {self.seen.shape}: expected bool of shape ({count},)"
+            )
+        if self.position_sigma is not None:
+            sigma = self.position_sigma
+            if sigma.shape != (count,) or sigma.dtype != np.float64:
+                raise ValueError(
+                    f"estimate: position_sigma is {sigma.dtype} of shape {sigma.shape}: "
+                    f"expected float64 of shape ({count},)"
+                )
+            if not (np.isfinite(sigma) & (sigma >= 0)).all():
+                raise ValueError("estimate: a position_sigma is negative or not a finite number")
+        if self.rope < 0:
+            raise ValueError(f"estimate: rope = {self.rope} is negative")
 
     @classmethod
-    def lost(cls, stamp_ns: int, reason: str, point_count: int = 0) -> Estimate:
+    def lost(cls, stamp_ns: int, reason: str, point_count: int = 0, rope: int = 0) -> Estimate:
         """Nothing to report, and why."""
-        return cls(stamp_ns, Status.LOST, (reason,), point_count=point_count)
+        return cls(stamp_ns, Status.LOST, (reason,), point_count=point_count, rope=rope)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

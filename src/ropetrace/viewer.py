@@ -8,9 +8,11 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ropetrace.errors import import_extra
+from ropetrace.results.base import rope_name
 from ropetrace.types import Cloud, CloudFrame, Estimate, FloatArray, Frame, Motion, RgbdFrame, Status, Waypoints
 
 rr: Any = import_extra("rerun", "viewer")
@@ -49,6 +51,14 @@ NODE_COLORS = np.array(
     np.uint8,
 )
 """Given in turn along the chain, so that the cuts between slices show."""
+
+ROPE_COLORS = NODE_COLORS[[4, 1, 2, 5, 3, 6, 0]]
+"""Of the centrelines of the first rope, the second, ..., in turn."""
+
+HIDDEN_PALER = 0.45
+"""How far the colour of a hidden part is moved towards white."""
+
+RING_CORNERS = 24
 
 ARM_COLOR = (200, 205, 210)
 TOOL_AXES = 0.08
@@ -96,6 +106,7 @@ def default_blueprint(arm: bool = False) -> Any:
 
     With an arm, the distance of its tool from the rope takes the place of the count of points.
     """
+    lines = [f"+ /{rope_entity(rope)}/{part}" for rope in range(len(ROPE_COLORS)) for part in ("centerline", "hidden")]
     last = ("Tool to rope (m)", "/plots/tool_distance") if arm else ("Points", "/plots/point_count")
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -106,7 +117,7 @@ def default_blueprint(arm: bool = False) -> Any:
                         rrb.Spatial2DView(
                             name=name.capitalize(),
                             origin="/camera",
-                            contents=["+ /camera", f"+ /camera/{name}", "+ /rope/centerline"],
+                            contents=["+ /camera", f"+ /camera/{name}", *lines],
                         )
                         for name in ("image", "depth")
                     ),
@@ -127,12 +138,19 @@ def default_blueprint(arm: bool = False) -> Any:
     )
 
 
+def rope_entity(rope: int) -> str:
+    """The entity of a rope."""
+    return "rope" if rope == 0 else rope_name(rope)
+
+
 class RerunLog:
     """Logs a run to a Rerun recording, on the timelines ``frame`` (its index) and ``time`` (its stamp).
 
     The entities are ``/camera`` with ``image`` (the colour; the depth, if that is all) and ``depth``;
-    ``/scene``, a frame's whole cloud; ``/rope`` with ``cloud``, ``nodes``, ``centerline``, ``axes`` and
-    ``velocity``; ``/status``; ``/plots`` with ``length``, ``speed`` (of the fastest waypoint) and ``point_count``.
+    ``/scene``, a frame's whole cloud; ``/rope`` with ``cloud``, ``nodes``, ``centerline`` (what the camera sees of
+    it), ``hidden`` (what it does not), ``sigma`` (rings round that, as wide as the tracker's standard deviation),
+    ``name``, ``axes`` and ``velocity``; ``/status``; ``/plots`` with ``length``, ``speed`` (of the fastest waypoint)
+    and ``point_count``. Further ropes are ``/rope_1`` ..., ``/status/rope_1`` and ``/plots/length/rope_1``.
 
     Parameters
     ----------
@@ -158,7 +176,8 @@ class RerunLog:
         self._recording = recording
         self._pose = np.eye(4) if frame_name == "camera" else frame_from_camera
         self._camera: Any = None
-        self._reported: tuple[Status, tuple[str, ...]] | None = None
+        self._index: int | None = None
+        self._reported: dict[int, tuple[Status, tuple[str, ...]]] = {}
         axes = rr.ViewCoordinates.RDF if frame_name == "camera" else rr.ViewCoordinates.RIGHT_HAND_Z_UP
         recording.log("/", axes, static=True)
         if self._pose is not None:
@@ -176,7 +195,7 @@ class RerunLog:
         cloud: Cloud | None = None,
         arm: ArmView | None = None,
     ) -> None:
-        """Log one frame; what it lacks is cleared, so that no picture outlives its frame.
+        """Log one rope in one frame; what the frame lacks is cleared, so that no picture outlives its frame.
 
         Parameters
         ----------
@@ -185,17 +204,23 @@ class RerunLog:
         estimate : Estimate
             What the tracker says.
         frame : RgbdFrame or CloudFrame, optional
-            What the tracker saw.
+            What the tracker saw; logged once, with the first rope of the frame.
         cloud : Cloud, optional
-            The points that it took for the rope.
+            The points that it took for the rope; logged once, too.
         arm : ArmView, optional
             An arm that works on the rope; the last one stays in the picture.
         """
         self._recording.set_time("frame", sequence=index)
         self._recording.set_time("time", timestamp=np.datetime64(estimate.stamp_ns, "ns"))
-        self._log_images(frame)
-        self._log_scene(frame)
-        self._log_rope(estimate, cloud)
+        if index != self._index:
+            self._index = index
+            self._log_images(frame)
+            self._log_scene(frame)
+            for rope in {0, *self._reported}:
+                self._recording.log(rope_entity(rope), rr.Clear(recursive=True))
+            self._log_cloud(cloud)
+        self._log_rope(estimate)
+        self._log_plots(estimate)
         self._log_status(estimate)
         if arm is not None:
             self._log_arm(arm)
@@ -242,34 +267,30 @@ class RerunLog:
         colors = NO_NODE_COLOR if frame.colors is None else frame.colors[::step]
         self._recording.log("scene", rr.Points3D(frame.points[::step], colors=colors, radii=rr.Radius.ui_points(1.0)))
 
-    def _log_rope(self, estimate: Estimate, cloud: Cloud | None) -> None:
-        self._recording.log("rope", rr.Clear(recursive=True))
-        if cloud is not None:
-            step = -(-len(cloud.points) // CLOUD_POINTS) or 1
-            node = cloud.node[::step]
-            colors = np.where(
-                node[:, None] >= 0, NODE_COLORS[node % len(NODE_COLORS)], np.array(NO_NODE_COLOR, np.uint8)
-            )
-            self._recording.log(
-                "rope/cloud", rr.Points3D(cloud.points[::step], colors=colors, radii=rr.Radius.ui_points(1.0))
-            )
+    def _log_cloud(self, cloud: Cloud | None) -> None:
+        if cloud is None:
+            return
+        step = -(-len(cloud.points) // CLOUD_POINTS) or 1
+        node = cloud.node[::step]
+        colors = np.where(node[:, None] >= 0, NODE_COLORS[node % len(NODE_COLORS)], np.array(NO_NODE_COLOR, np.uint8))
+        self._recording.log(
+            "rope/cloud", rr.Points3D(cloud.points[::step], colors=colors, radii=rr.Radius.ui_points(1.0))
+        )
+
+    def _log_rope(self, estimate: Estimate) -> None:
+        entity = rope_entity(estimate.rope)
         if len(estimate.nodes):
             colors = NODE_COLORS[np.arange(len(estimate.nodes)) % len(NODE_COLORS)]
             self._recording.log(
-                "rope/nodes", rr.Points3D(estimate.nodes, colors=colors, radii=rr.Radius.ui_points(5.0))
+                f"{entity}/nodes", rr.Points3D(estimate.nodes, colors=colors, radii=rr.Radius.ui_points(5.0))
             )
-        if len(estimate.waypoints):
-            self._recording.log(
-                "rope/centerline",
-                rr.LineStrips3D(
-                    [estimate.waypoints.positions],
-                    colors=STATUS_COLORS[estimate.status],
-                    radii=rr.Radius.ui_points(1.75),
-                ),
-            )
-            self._recording.log("rope/axes", _axes(estimate.waypoints))
-            if estimate.motion is not None:
-                self._recording.log("rope/velocity", _velocity(estimate.waypoints, estimate.motion))
+        if not len(estimate.waypoints):
+            return
+        for name, picture in _centerline(estimate).items():
+            self._recording.log(f"{entity}/{name}", picture)
+        self._recording.log(f"{entity}/axes", _axes(estimate.waypoints))
+        if estimate.motion is not None:
+            self._recording.log(f"{entity}/velocity", _velocity(estimate.waypoints, estimate.motion))
 
     def _log_arm(self, arm: ArmView) -> None:
         along = arm.ends - arm.starts
@@ -300,18 +321,79 @@ class RerunLog:
         )
         self._recording.log("plots/tool_distance", rr.Scalars(arm.distance))
 
+    def _log_plots(self, estimate: Estimate) -> None:
+        rope = estimate.rope
+        if rope not in self._reported and rope != 0:
+            for number in (0, rope):
+                style = rr.SeriesLines(colors=rope_color(number), names=f"rope {number}")
+                for name in ("length", "point_count", "speed"):
+                    self._recording.log(_with_rope(f"plots/{name}", number), style, static=True)
+        self._recording.log(_with_rope("plots/length", rope), rr.Scalars(estimate.waypoints.length))
+        self._recording.log(_with_rope("plots/point_count", rope), rr.Scalars(estimate.point_count))
+        self._recording.log(_with_rope("plots/speed", rope), _speed(estimate))
+
     def _log_status(self, estimate: Estimate) -> None:
-        self._recording.log("plots/length", rr.Scalars(estimate.waypoints.length))
-        self._recording.log("plots/point_count", rr.Scalars(estimate.point_count))
-        self._recording.log("plots/speed", _speed(estimate))
-        if self._reported == (estimate.status, estimate.reasons):
+        rope = estimate.rope
+        if self._reported.get(rope) == (estimate.status, estimate.reasons):
             return
-        self._reported = (estimate.status, estimate.reasons)
-        text = ": ".join(filter(None, (str(estimate.status), "; ".join(estimate.reasons))))
+        self._reported[rope] = (estimate.status, estimate.reasons)
+        name = f"rope {rope}" if rope else ""
+        text = ": ".join(filter(None, (name, str(estimate.status), "; ".join(estimate.reasons))))
         self._recording.log(
-            "status",
+            _with_rope("status", rope),
             rr.TextLog(text, level=STATUS_LEVELS[estimate.status], color=STATUS_COLORS[estimate.status]),
         )
+
+
+def _with_rope(entity: str, rope: int) -> str:
+    """Where a rope's part of what all ropes have is: the first one's is the entity itself."""
+    return entity if rope == 0 else f"{entity}/{rope_name(rope)}"
+
+
+def rope_color(rope: int) -> NDArray[np.uint8]:
+    """The colour of a rope's centreline."""
+    return np.asarray(ROPE_COLORS[rope % len(ROPE_COLORS)])
+
+
+def _centerline(estimate: Estimate) -> dict[str, Any]:
+    """The centreline's pictures by name: its seen and hidden parts, the rings, and its name where it starts."""
+    waypoints = estimate.waypoints
+    points, color = waypoints.positions, rope_color(estimate.rope)
+    pale = (color + HIDDEN_PALER * (255 - color)).astype(np.uint8)
+    seen = np.ones(len(points), bool) if estimate.seen is None else estimate.seen
+    seen_steps = seen[:-1] & seen[1:]
+    name = f"rope {estimate.rope}"
+    pictures = {
+        "name": rr.Points3D(
+            points[:1],
+            labels=[name if estimate.status is Status.OK else f"{name}: {estimate.status}"],
+            colors=STATUS_COLORS[estimate.status],
+            radii=rr.Radius.ui_points(3.0),
+            show_labels=True,
+        )
+    }
+    for part, steps, shade, width in (("centerline", seen_steps, color, 1.75), ("hidden", ~seen_steps, pale, 1.0)):
+        if steps.any():
+            pictures[part] = rr.LineStrips3D(_strips(points, steps), colors=shade, radii=rr.Radius.ui_points(width))
+    ringed = seen if estimate.seen is None else ~seen
+    if estimate.position_sigma is not None and ringed.any():
+        rings = _rings(waypoints, estimate.position_sigma, ringed)
+        pictures["sigma"] = rr.LineStrips3D(rings, colors=pale, radii=rr.Radius.ui_points(0.5))
+    return pictures
+
+
+def _strips(points: FloatArray, chosen: NDArray[np.bool_]) -> list[FloatArray]:
+    """The parts of a line of W points whose segments, (W - 1,), are chosen."""
+    bounds = np.flatnonzero(np.diff(chosen, prepend=False, append=False))
+    return [points[start : end + 1] for start, end in bounds.reshape(-1, 2)]
+
+
+def _rings(waypoints: Waypoints, radii: FloatArray, chosen: NDArray[np.bool_]) -> FloatArray:
+    """Closed circles of the radii round the rope at the K chosen of W waypoints, (K, corners, 3)."""
+    angle = np.linspace(0, 2 * np.pi, RING_CORNERS + 1)
+    circle = np.column_stack((np.zeros_like(angle), np.cos(angle), np.sin(angle)))
+    turns = Rotation.from_quat(waypoints.quaternions[chosen]).as_matrix()
+    return waypoints.positions[chosen, None] + radii[chosen, None, None] * (circle @ turns.transpose(0, 2, 1))
 
 
 def _step(waypoints: Waypoints) -> int:

@@ -18,11 +18,12 @@ from ropetrace.types import Cloud, Estimate, Frame
 class NpzWriter(Closing):
     """Arrays that ``numpy.load(path, allow_pickle=False)`` reads.
 
-    One entry a frame, F in all: ``frame``, ``stamp_ns``, ``ahead_ns``, ``status``, ``reasons`` (one a line) and
-    ``point_count``. All frames end to end: ``nodes (sum M, 3)``, ``positions (sum W, 3)``, ``quaternions
-    (sum W, 4)``, ``arc_length (sum W,)`` and the arrays of `Motion`, ``(sum W, 3)`` each, NaN where the motion is
-    not known. ``node_offset`` and ``waypoint_offset`` have F + 1 entries: the waypoints of frame i are
-    ``positions[waypoint_offset[i]:waypoint_offset[i + 1]]``. ``metadata`` is a JSON text, ``frame_name`` in it.
+    One entry an estimate, E in all: ``frame``, ``stamp_ns``, ``ahead_ns``, ``status``, ``reasons`` (one a line),
+    ``point_count`` and ``rope``. All estimates end to end: ``nodes (sum M, 3)``, ``positions (sum W, 3)``,
+    ``quaternions (sum W, 4)``, ``arc_length (sum W,)``, the arrays of `Motion`, ``(sum W, 3)`` each, and ``seen`` (1 or
+    0) and ``tracker_sigma``, ``(sum W,)``; NaN for what is not known. ``node_offset`` and ``waypoint_offset`` have
+    E + 1 entries: the waypoints of estimate i are ``positions[waypoint_offset[i]:waypoint_offset[i + 1]]``.
+    ``metadata`` is a JSON text, ``frame_name`` in it.
 
     Raises
     ------
@@ -32,7 +33,7 @@ class NpzWriter(Closing):
 
     def __init__(self, path: Path, *, overwrite: bool, frame_name: str, metadata: Mapping[str, str]) -> None:
         self._metadata = json.dumps({**metadata, "frame_name": frame_name}, ensure_ascii=False)
-        self._frames: list[tuple[int, int, int, str, str, int]] = []
+        self._estimates: list[tuple[int, int, int, str, str, int, int]] = []
         self._node_offset = [0]
         self._waypoint_offset = [0]
         self._parts: dict[str, list[NDArray[Any]]] = {
@@ -41,13 +42,15 @@ class NpzWriter(Closing):
             "quaternions": [np.empty((0, 4))],
             "arc_length": [np.empty(0)],
             **{name: [np.empty((0, 3))] for name in MOTION_ARRAYS},
+            "seen": [np.empty(0)],
+            "tracker_sigma": [np.empty(0)],
         }
         self._closed = False
         self._checkpoint = Checkpoint(path, overwrite, self._save)
 
     def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
         waypoints = estimate.waypoints
-        self._frames.append(
+        self._estimates.append(
             (
                 index,
                 estimate.stamp_ns,
@@ -55,6 +58,7 @@ class NpzWriter(Closing):
                 str(estimate.status),
                 "\n".join(estimate.reasons),
                 estimate.point_count,
+                estimate.rope,
             )
         )
         self._node_offset.append(self._node_offset[-1] + len(estimate.nodes))
@@ -65,6 +69,9 @@ class NpzWriter(Closing):
         self._parts["arc_length"].append(waypoints.arc_length)
         for name, part in zip(MOTION_ARRAYS, np.hsplit(motion_rows(estimate), len(MOTION_ARRAYS)), strict=True):
             self._parts[name].append(part)
+        unknown = np.full(len(waypoints), np.nan)
+        self._parts["seen"].append(unknown if estimate.seen is None else estimate.seen.astype(float))
+        self._parts["tracker_sigma"].append(unknown if estimate.position_sigma is None else estimate.position_sigma)
         self._checkpoint.write_if_due()
 
     def close(self) -> None:
@@ -75,8 +82,8 @@ class NpzWriter(Closing):
     def _save(self, file: BinaryIO) -> None:
         for name, parts in self._parts.items():
             self._parts[name] = [np.concatenate(parts)]
-        per_frame = zip(*self._frames, strict=True) if self._frames else ((),) * 6
-        frame, stamp_ns, ahead_ns, status, reasons, point_count = per_frame
+        per_estimate = zip(*self._estimates, strict=True) if self._estimates else ((),) * 7
+        frame, stamp_ns, ahead_ns, status, reasons, point_count, rope = per_estimate
         np.savez(
             file,
             frame=np.array(frame, np.int64),
@@ -85,6 +92,7 @@ class NpzWriter(Closing):
             status=np.array(status, np.str_),
             reasons=np.array(reasons, np.str_),
             point_count=np.array(point_count, np.int64),
+            rope=np.array(rope, np.int64),
             node_offset=np.array(self._node_offset, np.int64),
             waypoint_offset=np.array(self._waypoint_offset, np.int64),
             metadata=np.array(self._metadata),

@@ -32,7 +32,11 @@ MOTION_COLUMNS = tuple(
 FLOAT_COLUMNS = WAYPOINT_COLUMNS + MOTION_COLUMNS
 """The columns of a row that hold numbers with a fraction."""
 
-COLUMNS = STATUS_COLUMNS + FLOAT_COLUMNS
+TRACKER_COLUMNS = ("rope", "seen", "tracker_sigma")
+"""The columns of a row that say which rope it is and what the tracker tells of the waypoint: whether the camera saw it,
+and the standard deviation of its position, metres. The last two are empty where it does not tell."""
+
+COLUMNS = STATUS_COLUMNS + FLOAT_COLUMNS + TRACKER_COLUMNS
 """The columns of the table formats, in order."""
 
 
@@ -50,11 +54,16 @@ def float_rows(estimate: Estimate) -> FloatArray:
     return np.column_stack((waypoints.arc_length, waypoints.positions, waypoints.quaternions, motion_rows(estimate)))
 
 
+def rope_name(rope: int) -> str:
+    """What the topics and entities of a rope are called by."""
+    return f"rope_{rope}"
+
+
 class ResultWriter(Protocol):
-    """Takes the estimates of a run, one call a frame. A context manager that closes itself."""
+    """Takes the estimates of a run, a call for each rope of a frame. A context manager that closes itself."""
 
     def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
-        """Add the estimate of one frame.
+        """Add the estimate of one rope in one frame; those of a frame follow one another.
 
         Parameters
         ----------

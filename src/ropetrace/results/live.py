@@ -40,8 +40,8 @@ HINT = "write the pictures to a file instead (--out run.rrd) and open it where t
 class LiveViewer(Closing):
     """Shows the latest estimate in the Rerun viewer; a `ResultWriter` that never makes its caller wait.
 
-    `write` puts the frame into a slot and returns. A thread takes it from there; a frame that is still in the
-    slot when the next one comes is skipped. The app listens on 127.0.0.1 only.
+    `write` puts the estimate into a slot, beside those of other ropes in the same frame, and returns. A thread takes
+    them from there; what is still in the slot when the next frame comes is skipped. The app listens on 127.0.0.1 only.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class LiveViewer(Closing):
     Attributes
     ----------
     skipped : int
-        Frames that were not shown so far.
+        Frames that were not shown so far, or not with all their ropes.
     port : int
         Where the app listens.
 
@@ -75,7 +75,7 @@ class LiveViewer(Closing):
         arm: bool = False,
     ) -> None:
         self.skipped = 0
-        self._slot: tuple[int, Estimate, Frame | None, Cloud | None, ArmView | None] | None = None
+        self._slot: list[tuple[int, Estimate, Frame | None, Cloud | None, ArmView | None]] = []
         self._changed = threading.Condition()
         self._stopping = False
         self._app, self.port = _start_app(arguments)
@@ -102,9 +102,10 @@ class LiveViewer(Closing):
         arm: ArmView | None = None,
     ) -> None:
         with self._changed:
-            if self._slot is not None or not self._thread.is_alive():
-                self.skipped += 1
-            self._slot = (index, estimate, frame, cloud, arm)
+            if not self._slot or self._slot[0][0] != index:
+                self.skipped += bool(self._slot) or not self._thread.is_alive()
+                self._slot = []
+            self._slot.append((index, estimate, frame, cloud, arm))
             self._changed.notify()
 
     def close(self, *, keep_window: bool = True) -> None:
@@ -129,12 +130,13 @@ class LiveViewer(Closing):
         warned = False
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._slot is not None or self._stopping)
-                slot, self._slot = self._slot, None
-            if slot is None or self._app.poll() is not None:
+                self._changed.wait_for(lambda: self._slot or self._stopping)
+                slot, self._slot = self._slot, []
+            if not slot or self._app.poll() is not None:
                 break
             try:
-                self._log.log(*slot)
+                for shown in slot:
+                    self._log.log(*shown)
                 self._recording.flush(timeout_sec=SEND_SECONDS)
             except Exception as error:
                 # Whatever is wrong with a picture must not stop the tracking.

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ropetrace.errors import import_extra
 from ropetrace.results.base import FLOAT_COLUMNS, Closing, float_rows
@@ -18,7 +19,7 @@ arrow_parquet: Any = import_extra("pyarrow.parquet", "parquet")
 
 
 class ParquetWriter(Closing):
-    """One row a waypoint; a frame without waypoints is one row with nulls, and an unknown motion is nulls.
+    """One row a waypoint; an estimate without waypoints is one row with nulls, and what is unknown is nulls.
 
     The metadata are key-values of the schema, `frame_name` among them.
 
@@ -37,6 +38,9 @@ class ParquetWriter(Closing):
                 ("waypoint", arrow.int32()),
                 ("status", arrow.string()),
                 *((name, arrow.float64()) for name in FLOAT_COLUMNS),
+                ("rope", arrow.int32()),
+                ("seen", arrow.bool_()),
+                ("tracker_sigma", arrow.float64()),
             ],
             metadata={**metadata, "frame_name": frame_name},
         )
@@ -59,6 +63,9 @@ class ParquetWriter(Closing):
                     arrow.array([str(estimate.status)] * rows),
                     # `from_pandas` is what makes a NaN a null.
                     *(arrow.array(column, from_pandas=True) for column in np.ascontiguousarray(values.T)),
+                    np.full(rows, estimate.rope, np.int32),
+                    _column(estimate.seen, rows, arrow.bool_()),
+                    _column(estimate.position_sigma, rows, arrow.float64()),
                 ],
                 schema=self._schema,
             )
@@ -75,3 +82,8 @@ class ParquetWriter(Closing):
         table = arrow.Table.from_batches(self._batches, self._schema).combine_chunks()
         arrow_parquet.write_table(table, file)
         self._batches = table.to_batches()
+
+
+def _column(values: NDArray[Any] | None, rows: int, kind: Any) -> Any:
+    """The values of `rows` waypoints; nulls where there are none."""
+    return arrow.nulls(rows, kind) if values is None or not len(values) else arrow.array(values, kind)

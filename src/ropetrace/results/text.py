@@ -10,10 +10,10 @@ from ropetrace.types import Cloud, Estimate, Frame
 
 
 class CsvWriter(Closing):
-    """One row a waypoint; a frame without waypoints is one row with empty cells, and an unknown motion is empty cells.
+    """One row a waypoint; an estimate without waypoints is one row with empty cells, and what is not known is empty.
 
     Numbers have the fewest digits that read back as exactly the same double, so that a CSV, a Parquet and an
-    NPZ file of one run are equal to the last bit. A frame reaches the system in one write, whole. Metadata
+    NPZ file of one run are equal to the last bit. An estimate reaches the system in one write, whole. Metadata
     are not kept: a comment line would trip what reads plain CSV.
 
     Raises
@@ -30,13 +30,21 @@ class CsvWriter(Closing):
     def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
         start = f"{index},{estimate.stamp_ns},{estimate.ahead_ns},"
         if not len(estimate.waypoints):
-            self._file.append(f"{start},{estimate.status}{',' * len(FLOAT_COLUMNS)}\n".encode())
+            self._file.append(f"{start},{estimate.status}{',' * len(FLOAT_COLUMNS)},{estimate.rope},,\n".encode())
             return
         rows = (
-            f"{start}{number},{estimate.status},{','.join(map(repr, row))}\n"
-            for number, row in enumerate(float_rows(estimate).tolist())
+            f"{start}{number},{estimate.status},{','.join(map(repr, row))},{estimate.rope},{told}\n"
+            for number, (row, told) in enumerate(zip(float_rows(estimate).tolist(), _told(estimate), strict=True))
         )
         self._file.append("".join(rows).replace(",nan", ",").encode())
 
     def close(self) -> None:
         self._file.close()
+
+
+def _told(estimate: Estimate) -> list[str]:
+    """The cells of each waypoint for what the tracker tells of it, empty where it does not."""
+    silent = [""] * len(estimate.waypoints)
+    seen = silent if estimate.seen is None else [str(int(value)) for value in estimate.seen]
+    sigma = silent if estimate.position_sigma is None else [repr(value) for value in estimate.position_sigma.tolist()]
+    return [",".join(pair) for pair in zip(seen, sigma, strict=True)]
