@@ -90,6 +90,28 @@ def sample_spline(chain: FloatArray, spacing: float) -> tuple[FloatArray, FloatA
     return positions, tangents, arc_length
 
 
+def spline_at(knots: FloatArray, chain: FloatArray, places: FloatArray) -> FloatArray:
+    """Points of a natural cubic spline through the chain.
+
+    Parameters
+    ----------
+    knots : (M,) float array
+        Where the chain's points are along it, M >= 2, growing, metres.
+    chain : (M, 3) float array
+        Metres.
+    places : (P,) float array
+        Growing, from the first to the last knot, metres.
+
+    Returns
+    -------
+    (P, 3) float array
+        Metres.
+    """
+    points = np.empty((len(places), 3))
+    _spline_at(knots, np.ascontiguousarray(chain), places, points)
+    return points
+
+
 def waypoint_frames(tangents: FloatArray) -> FloatArray:
     """Rotation matrices of the waypoints' frames (equations 15-17).
 
@@ -248,6 +270,17 @@ def _sample_spline(chain: Any, spacing: float) -> Any:
         for k in range(3):
             tangents[index, k] = slope[k] / size
     return positions, tangents, arc_length
+
+
+@njit(cache=True, nogil=True)
+def _spline_at(knots: Any, chain: Any, places: Any, points: Any) -> None:
+    second = _second_derivatives(knots, chain)
+    slope = np.empty(3)
+    m = 0
+    for index in range(len(places)):
+        while m < len(knots) - 2 and knots[m + 1] < places[index]:
+            m += 1
+        _evaluate(knots, chain, second, m, places[index], points[index], slope)
 
 
 @njit(cache=True, nogil=True)

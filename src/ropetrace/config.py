@@ -240,6 +240,10 @@ class MotionConfig:
     """`arc_length`: points at equal arc length, each with a bank of filters. `closest`: the paper's Algorithm 1."""
 
 
+MOST_ROPES = 50
+"""That are followed at once."""
+
+
 @dataclass(frozen=True, slots=True)
 class RopeConfig:
     """Everything that ropetrace must be told of a rope; the diameter and the colour are enough.
@@ -256,6 +260,8 @@ class RopeConfig:
     """The rope's colour in full light, ``#rrggbb``."""
     method: str = "slicing"
     """The tracker."""
+    ropes: int | Literal["auto"] = 1
+    """How many ropes are followed; ``"auto"`` for all that are seen. Only `persistent` follows more than one."""
     camera_pose: tuple[float, float, float, float, float, float, float] | None = None
     """The camera in the world: x, y, z in metres, then the quaternion qx, qy, qz, qw of its optical frame."""
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
@@ -284,6 +290,14 @@ class RopeConfig:
                 self.segmentation.lab_min is None and self.segmentation.color_pixel is None,
                 "color, segmentation.lab_min and segmentation.color_pixel each set the colour: give one of them",
             )
+        _require(
+            self.ropes == "auto" or (isinstance(self.ropes, int) and 1 <= self.ropes <= MOST_ROPES),
+            f'ropes = {self.ropes!r}: expected 1 to {MOST_ROPES}, or "auto"',
+        )
+        _require(
+            self.ropes == 1 or self.method == "persistent",
+            f'ropes = {self.ropes!r} with method = "{self.method}": only "persistent" follows more than one',
+        )
         if self.camera_pose is not None:
             _require(
                 _finite(*self.camera_pose) and abs(math.hypot(*self.camera_pose[3:]) - 1) < 1e-3,

@@ -169,6 +169,22 @@ def runs_backwards(chain: FloatArray, previous: FloatArray) -> bool:
     return bool(_runs_backwards(chain, previous))
 
 
+def starts_at_end(chain: FloatArray, first_point: tuple[float, float, float] | None = None) -> bool:
+    """Whether a chain's last node is rather its start: nearer to the given point, or higher in the image.
+
+    Parameters
+    ----------
+    chain : (M, 3) float array
+        Nodes in order, metres, camera frame.
+    first_point : (x, y, z), optional
+        Where ropes start, metres.
+    """
+    if first_point is None:
+        return bool(chain[-1, 1] < chain[0, 1])
+    distances = np.linalg.norm(chain[[0, -1]] - np.array(first_point), axis=1)
+    return bool(distances[1] < distances[0])
+
+
 @njit(cache=True, nogil=True)
 def _runs_backwards(chain: Any, previous: Any) -> bool:
     here, before = _sampled(chain), _sampled(previous)

@@ -8,10 +8,12 @@ from importlib import import_module
 from ropetrace.config import RopeConfig
 from ropetrace.errors import ConfigError
 from ropetrace.trackers.base import Mask, Tracker
+from ropetrace.trackers.persistent import PersistentTracker
 from ropetrace.trackers.slicing import SlicingTracker
 from ropetrace.types import FloatArray
 
 METHODS = {
+    "persistent": "PersistentTracker",
     "slicing": "SlicingTracker",
     "schulman": "SchulmanTracker",
     "cpd": "CpdTracker",
@@ -22,7 +24,7 @@ METHODS = {
 }
 """The trackers' classes, each in the module of its method's name."""
 
-__all__ = ["METHODS", "Mask", "SlicingTracker", "Tracker", "make_tracker"]
+__all__ = ["METHODS", "Mask", "PersistentTracker", "SlicingTracker", "Tracker", "make_tracker"]
 
 
 def make_tracker(config: RopeConfig, mask: Mask | None = None, nodes: FloatArray | None = None) -> Tracker:
@@ -36,7 +38,7 @@ def make_tracker(config: RopeConfig, mask: Mask | None = None, nodes: FloatArray
         Replaces the colour gate: see `ropetrace.trackers.base.Mask`.
     nodes : (M, 3) float array, optional
         Where to start, on the rope's axis, in order, metres, camera frame; M is the method's number of nodes. Without
-        them a tracker starts from slicing. Slicing itself takes none: its frames stand for themselves.
+        them a tracker starts from slicing. `slicing` and `persistent` take none.
 
     Raises
     ------
@@ -49,10 +51,12 @@ def make_tracker(config: RopeConfig, mask: Mask | None = None, nodes: FloatArray
         close = difflib.get_close_matches(config.method, METHODS, 1)
         hint = f"; did you mean {close[0]}?" if close else ""
         raise ConfigError(f"method = {config.method!r}: expected one of {', '.join(METHODS)}{hint}")
+    if config.method in ("slicing", "persistent") and nodes is not None:
+        raise ConfigError(f'method = "{config.method}" takes no nodes to start from')
     if config.method == "slicing":
-        if nodes is not None:
-            raise ConfigError('method = "slicing" takes no nodes to start from')
         return SlicingTracker(config, mask)
+    if config.method == "persistent":
+        return PersistentTracker(config, mask)
     module = import_module(f"ropetrace.trackers.{config.method}")
     tracker: Tracker = getattr(module, METHODS[config.method])(config, mask, nodes)
     return tracker

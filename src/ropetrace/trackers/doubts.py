@@ -17,7 +17,7 @@ TOO_THIN, TOO_WIDE = 0.6, 1.5
 _FARTHEST = 50.0
 """No depth camera sees a rope from this far, metres."""
 
-_KINK = np.radians(100)
+KINK = np.radians(100)
 """No rope turns by more than this from one slice to the next."""
 
 _FEW_SLICES = 5
@@ -76,25 +76,31 @@ class Doubts:
         widths : (M,) float array
             How wide the slices look, metres.
         """
-        diameter = self._diameter
-        seen = float(np.median(widths))
-        trouble = []
-        if not TOO_THIN * diameter < seen < TOO_WIDE * diameter:
-            trouble.append(
-                f"the points are as wide as a tube of {seen * 1e3:.1f} mm, not of "
-                f"{diameter * 1e3:.1f} mm: the diameter is wrong, or something else passes the colour or the box"
-            )
-        elif np.count_nonzero(widths > 2 * diameter) > 0.1 * len(widths):
-            trouble.append("parts are far wider than the rope: a hand, a knot or a branch is taken for rope")
+        trouble = self.of_widths(widths)
         if len(nodes) < _FEW_SLICES:
             trouble.append(f"only {len(nodes)} slices: too short for a rope, or the diameter is too large")
-        if strands_overlap(nodes, diameter):
+        if strands_overlap(nodes, self._diameter):
             trouble.append("strands overlap in the camera's view: the order there may be wrong")
-        elif sharpest_turn(nodes) > _KINK:
+        elif sharpest_turn(nodes) > KINK:
             trouble.append("the curve turns back sharply: the order there may be wrong")
-        if np.median(nodes[:, 2]) > _FARTHEST:
-            trouble.append(f"the points are {np.median(nodes[:, 2]):.0f} m away: is the recording in millimetres?")
-        return trouble
+        return trouble + self.of_distance(nodes)
+
+    def of_widths(self, widths: FloatArray) -> list[str]:
+        """What is too thin or too wide for the rope, from how wide the slices look, (M,), metres."""
+        seen = float(np.median(widths))
+        if not TOO_THIN * self._diameter < seen < TOO_WIDE * self._diameter:
+            return [
+                f"the points are as wide as a tube of {seen * 1e3:.1f} mm, not of "
+                f"{self._diameter * 1e3:.1f} mm: the diameter is wrong, or something else passes the colour or the box"
+            ]
+        if np.count_nonzero(widths > 2 * self._diameter) > 0.1 * len(widths):
+            return ["parts are far wider than the rope: a hand, a knot or a branch is taken for rope"]
+        return []
+
+    def of_distance(self, nodes: FloatArray) -> list[str]:
+        """Whether nodes, (M, 3), metres, camera frame, are farther away than cameras see."""
+        away = float(np.median(nodes[:, 2]))
+        return [f"the points are {away:.0f} m away: is the recording in millimetres?"] if away > _FARTHEST else []
 
     def of_length(self, length: float, sound: bool) -> list[str]:
         """Whether the length is not what it was lately, in the frames that had nothing else wrong with them."""

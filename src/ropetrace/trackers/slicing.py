@@ -18,11 +18,13 @@ from ropetrace.ordering import (
     order_greedy,
     order_path,
     runs_backwards,
+    starts_at_end,
 )
 from ropetrace.segmentation import ColorGate, PositionBox, Segmenter
 from ropetrace.slicing import Slicer
 from ropetrace.trackers.base import Lap, Mask, no_lap
 from ropetrace.trackers.doubts import Doubts
+from ropetrace.trackers.strands import gaps_in_view, reach_of
 from ropetrace.types import (
     BadFrame,
     Cloud,
@@ -58,7 +60,7 @@ class SlicingTracker:
         )
         slicing = self.config.slicing
         assert slicing.variance_threshold is not None
-        self._slicer = Slicer(slicing.variance_threshold, slicing.min_points, slicing.max_nodes)
+        self.slicer = Slicer(slicing.variance_threshold, slicing.min_points, slicing.max_nodes)
         self.seen_diameter = 0.0
         self.reset()
 
@@ -109,14 +111,14 @@ class SlicingTracker:
         lap : callable
             Told of the end of each stage.
         """
-        slices = self._slicer.slice(points)
+        slices = self.slicer.slice(points)
         lap("slicing")
         if slices.capped:
             reasons.append(
-                f"more than {self._slicer.max_nodes} slices: background is taken for rope, or the diameter is too small"
+                f"more than {self.slicer.max_nodes} slices: background is taken for rope, or the diameter is too small"
             )
         if len(slices) < 2:
-            return Estimate.lost(stamp_ns, _too_little(points.shape[1], len(slices)), count)
+            return Estimate.lost(stamp_ns, too_little(points.shape[1], len(slices)), count)
 
         slices, trouble = self._in_order(slices)
         reasons += trouble
@@ -129,7 +131,7 @@ class SlicingTracker:
         nodes, widths = axis_points(points, slices, tangents, self.config.radius, self.config.slicing.surface_offset)
         self.seen_diameter = float(np.median(widths))
         reasons += self._doubts.of_shape(nodes, widths)
-        chain = extend_to_tips(nodes, _reach(slices, tangents))
+        chain = extend_to_tips(nodes, reach_of(slices, tangents))
         assert self.config.centerline.spacing is not None
         waypoints = make_waypoints(chain, self.config.centerline.spacing, self._waypoints)
         lap("centerline")
@@ -186,7 +188,7 @@ class SlicingTracker:
         """The slices along the rope from its start, without those that do not belong to it, and what to mistrust."""
         ordering = self.config.ordering
         graph = NodeGraph.of(slices.centroids, slices.covariances)
-        surface = bool(np.median(graph.touching) >= _SURFACE_NEIGHBOURS)
+        surface = bool(np.median(graph.touching) >= SURFACE_NEIGHBOURS)
         if ordering.method == "greedy":
             order = order_greedy(slices.centroids, int(np.argmax(end_scores(slices.centroids, ordering.first_point))))
         else:
@@ -196,7 +198,8 @@ class SlicingTracker:
         trouble = []
         ends = np.flatnonzero(gaps > ordering.max_gap)
         if len(ends):
-            ends = ends[_as_seen(gaps, graph, order, slices.centroids)[ends] > ordering.max_gap]
+            in_view = gaps_in_view(graph, order, slices.centroids[order])
+            ends = ends[in_view[ends] > ordering.max_gap]
         if len(ends):
             pieces = np.split(order, ends + 1)
             longest = max(pieces, key=lambda piece: int(slices.counts[piece].sum()))
@@ -221,10 +224,7 @@ class SlicingTracker:
             return runs_backwards(chain, self._chain)
         if ordering.method == "greedy":
             return False  # it started where equation 12 says
-        if ordering.first_point is None:
-            return bool(chain[-1, 1] < chain[0, 1])
-        distances = np.linalg.norm(chain[[0, -1]] - np.array(ordering.first_point), axis=1)
-        return bool(distances[1] < distances[0])
+        return starts_at_end(chain, ordering.first_point)
 
 
 BRIDGE_DIAMETERS = 3.0
@@ -233,27 +233,8 @@ BRIDGE_DIAMETERS = 3.0
 _FEW = 20
 """Fewer points than this make no rope, however they lie."""
 
-_ALONG_VIEW = 0.3
-"""How much a gap along the view counts: a rope that leads away from the camera hides its own next stretch."""
-
-_SURFACE_NEIGHBOURS = 4
+SURFACE_NEIGHBOURS = 4
 """Where the typical slice touches this many others, the points are a wall or a table, not a rope."""
-
-
-def _as_seen(gaps: FloatArray, graph: NodeGraph, order: NDArray[np.int64], centroids: FloatArray) -> FloatArray:
-    """The gaps of a chain, less what of them lies along the view, metres."""
-    directions = graph.directions[order[:-1], order[1:]]
-    views = (centroids[order[:-1]] + centroids[order[1:]]) / 2
-    views /= np.maximum(np.linalg.norm(views, axis=1, keepdims=True), 1e-9)
-    along = np.sum(directions * views, axis=1)
-    return gaps * np.sqrt(1 - (1 - _ALONG_VIEW**2) * along**2)
-
-
-def _reach(slices: Slices, tangents: FloatArray) -> tuple[float, float]:
-    """How far the first and the last slice go on beyond their centroids: half the length of an even spread, metres."""
-    first = tangents[0] @ slices.covariances[0] @ tangents[0]
-    last = tangents[-1] @ slices.covariances[-1] @ tangents[-1]
-    return float(np.sqrt(3 * max(first, 0.0))), float(np.sqrt(3 * max(last, 0.0)))
 
 
 def _distinct(chain: FloatArray) -> NDArray[np.bool_]:
@@ -262,7 +243,7 @@ def _distinct(chain: FloatArray) -> NDArray[np.bool_]:
     return np.concatenate([[True], np.einsum("ij,ij->i", steps, steps) > SHORTEST_STEP**2])
 
 
-def _too_little(points: int, slices: int) -> str:
+def too_little(points: int, slices: int) -> str:
     if slices == 1 and points >= _FEW:
         return (
             f"{points} points make a single slice: the diameter (or slicing.variance_threshold) is too large for them"
