@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -208,10 +209,48 @@ def test_a_mask_replaces_the_colour(run: Run, tmp_path: Path) -> None:
     assert set(statuses(tmp_path / "none.csv").values()) == {"lost"}
 
 
+def test_the_diameter_and_the_colour_are_found_and_told(run: Run, folder: Path, tmp_path: Path) -> None:
+    code, _, err = run("track", folder, "-d", "auto", "-c", "auto", "--out", "r.csv")
+    assert code == 0
+    told = {line.split()[0]: line for line in err.splitlines() if not line.startswith("track")}
+    assert list(told) == ["color", "diameter"]
+    assert "confidence" in told["color"]
+    assert "+/-" in told["diameter"]
+    settings = (tmp_path / "r.csv.toml").read_text()
+    diameter = float(re.search(r"^diameter = (.*)$", settings, re.MULTILINE)[1])  # type: ignore[index]
+    assert diameter == pytest.approx(0.024, rel=0.1)
+    assert 'color = "#c' in settings
+    assert set(statuses(tmp_path / "r.csv").values()) == {"ok"}
+
+
+def test_what_is_found_goes_with_what_the_config_says(run: Run, folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "rope.toml").write_text(f'diameter = "50mm"\ncolor = "{COLOR}"\n')
+    _, _, err = run("track", folder, "--config", "rope.toml", "-d", "auto")
+    assert "diameter" in err
+    assert "warning" not in err
+    _, _, err = run("doctor", folder, "--config", "rope.toml", "-c", "auto")
+    assert "not 50.0 mm" in err
+
+
+def test_the_colour_at_a_pixel(run: Run, folder: Path, tmp_path: Path) -> None:
+    rows_seen, columns_seen = np.nonzero(rope_frames(1)[0].depth)
+    middle = len(rows_seen) // 2
+    pixel = f"@{columns_seen[middle]},{rows_seen[middle]}"
+    code, _, err = run("track", folder, "-d", "24mm", "-c", pixel, "--out", "r.csv")
+    assert code == 0, err
+    assert 'color = "#c' in (tmp_path / "r.csv.toml").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["track", "nowhere", "-d", "6mm"], ["nowhere", "No such file"]),
+        (["track", "nowhere", "-d", "auto"], ["nowhere", "No such file"]),
+        (["track", "{folder}", "-d", "6mm", "-c", "@here"], ["@here", "@320,240"]),
+        (["track", "{folder}", "-d", "6mm", "-c", "@9999,1"], ["9999,1", "160x120"]),
+        (["track", "{folder}", "-d", "auto", "-c", "#00ff00"], ["#00ff00", "--diameter"]),
+        (["track", "{folder}", "-d", "auto", "--start", "99"], ["no frame"]),
+        (["compare", "{folder}", "-d", "auto"], ["track"]),
         (["track", "{empty}", "-d", "6mm"], ["empty"]),
         (["track", "{folder}"], ["--diameter"]),
         (["track", "{folder}", "-d", "0"], ["diameter", "0.5 mm"]),

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -96,7 +97,7 @@ class Track:
     """Replace results that exist."""
 
     def run(self) -> int:
-        config = self.rope.settings()
+        config = self.rope.settings(self.source.first_frames)
         predict = _prediction(self.predict, config)
         recording = self.source.open()
         return _track(
@@ -175,7 +176,7 @@ class Doctor:
             raise ConfigError(f"--frames {self.frames}: expected 1 to 10000")
         if self.picture.exists() and self.picture != _DOCTOR_PICTURE and not self.overwrite:
             raise OutputError(f"{self.picture} exists already: choose another name or give --overwrite")
-        config = self.rope.settings()
+        config = self.rope.settings(self.source.first_frames)
         recording = self.source.open()
         diagnosis = diagnose(_spread(recording, self.source.part, self.frames), config, recording.info())
         print("\n".join(diagnosis.lines()))
@@ -298,7 +299,7 @@ def _track(
                 recording.frames(start, limit),
                 tracker,
                 sinks,
-                motion=make_motion(config.motion.method, config.diameter),
+                motion=partial(make_motion, config.motion.method, config.diameter),
                 predict=predict,
                 first_index=start,
                 world_from_camera=pose,
