@@ -21,6 +21,9 @@ from ropetrace.types import FloatArray
 _WORST = 9.0
 """A strand's misfit, squared and in standard deviations, saturates here: farther off is no worse."""
 
+_SPREAD_COST = 1.4
+"""What it costs to lie where the rope is e times less sure than where it is surest, in misfit."""
+
 _TOO_FAR = 6.0
 """A strand without a clear end of the rope that misfits by more is not placed."""
 
@@ -272,7 +275,13 @@ def _near_places(point: Any, nodes: Any, sigma: Any, places: Any, distances: Any
 def _misfit(
     points: Any, arc: Any, sign: float, offset: float, nodes: Any, sigma: Any, spacing: float, length: float
 ) -> float:
-    """Mean of the saturated squared distances of a strand, laid at offset + sign arc, from the expected rope."""
+    """Mean of the saturated squared distances of a strand, laid at offset + sign arc, from the expected rope.
+
+    Where nobody knows where the rope is, everything fits: as in a normal density, spread costs, against the surest node.
+    """
+    least = sigma[0]
+    for m in range(len(sigma)):
+        least = min(least, sigma[m])
     total = 0.0
     for i in range(len(points)):
         place = offset + sign * arc[i]
@@ -282,8 +291,9 @@ def _misfit(
         square = (place - inside * spacing) ** 2
         for k in range(3):
             square += (points[i, k] - nodes[m, k] - part * (nodes[m + 1, k] - nodes[m, k])) ** 2
-        square /= (sigma[m] + part * (sigma[m + 1] - sigma[m])) ** 2
-        total += _WORST * square / (_WORST + square)
+        spread = sigma[m] + part * (sigma[m + 1] - sigma[m])
+        square /= spread * spread
+        total += _WORST * square / (_WORST + square) + _SPREAD_COST * np.log(spread / least)
     return total / len(points)
 
 

@@ -28,8 +28,11 @@ _LEAST_SIGMA, _FIRST_SIGMA = 0.5, 2.0
 _CALMING = 0.9
 """Part of the largest distance that is left with each frame, if no larger one comes."""
 
-_DRIFT = 0.3
-"""and what it grows by while a node is not seen, m/s,"""
+_LEAST_DRIFT, _DRIFT = 0.05, 0.3
+"""and what it grows by while a node is not seen: as fast as the rope has lately moved, between these, m/s,"""
+
+_LEASH = 1.0
+"""but by no more than this part of the way along the rope to what is seen,"""
 
 MOST_SIGMA = 0.3
 """up to this, metres."""
@@ -97,6 +100,8 @@ class WholeRope:
         The strands that it began with.
     surprise : float
         How far nodes that are seen have lately been from where they were expected, metres.
+    speed : float
+        How fast they have lately moved, m/s.
     waypoints : Waypoints, optional
         That were told last.
     other_length_for : float
@@ -113,6 +118,7 @@ class WholeRope:
     doubts: list[str]
     first: list[Laid]
     surprise: float
+    speed: float
     waypoints: Waypoints | None = None
     other_length_for: float = 0.0
 
@@ -120,7 +126,7 @@ class WholeRope:
     def begun(cls, laid: list[Laid], diameter: float, doubts: list[str]) -> WholeRope:
         """A rope from the first view of it."""
         nothing = np.empty((0, 3))
-        rope = cls(nothing, nothing, np.empty(0), np.empty(0), 0.0, (False, False), 0, doubts, laid, diameter)
+        rope = cls(nothing, nothing, np.empty(0), np.empty(0), 0.0, (False, False), 0, doubts, laid, diameter, _DRIFT)
         rope.begin_again(laid, diameter)
         return rope
 
@@ -152,8 +158,20 @@ class WholeRope:
         """Where it is expected this many seconds later."""
         ahead = _MEMORY * (1 - np.exp(-elapsed / _MEMORY))
         known = np.clip(_SURPRISES * self.surprise, _LEAST_SIGMA * diameter, _FIRST_SIGMA * diameter)
-        sigma = np.minimum(known + _DRIFT * (self.adrift + elapsed), MOST_SIGMA)
+        drift = np.clip(self.speed, _LEAST_DRIFT, _DRIFT) * (self.adrift + elapsed)
+        sigma = np.minimum(known + np.minimum(drift, _LEASH * self.away_from(self.adrift == 0)), MOST_SIGMA)
         return Expected(self.nodes + ahead * self.velocities, sigma, self.length, self.tips)
+
+    def away_from(self, seen: NDArray[np.bool_]) -> FloatArray:
+        """How far along the rope each node is from the next that is seen, (M,), metres; infinite if none is."""
+        places = self.places
+        if not seen.any():
+            return np.full(len(places), np.inf)
+        shown = places[seen]
+        after = np.searchsorted(shown, places)
+        right = np.abs(shown[np.minimum(after, len(shown) - 1)] - places)
+        left = np.abs(places - shown[np.maximum(after - 1, 0)])
+        return np.asarray(np.minimum(left, right))
 
     def span(self, start: float, end: float) -> None:
         """Reach from `start` to `end`, metres along the rope as it was: it is longer or shorter than was known."""
@@ -260,6 +278,8 @@ def advance(
     if follows.any():
         off = float(np.sqrt(np.mean(np.sum((nodes - expected.nodes)[follows] ** 2, axis=1))))
         rope.surprise = max(off, _CALMING * rope.surprise)
+        speed = float(np.sqrt(np.mean(np.sum(rope.velocities[follows] ** 2, axis=1))))
+        rope.speed = max(speed, _CALMING * rope.speed)
     rope.nodes = nodes
     rope.unseen = np.where(seen, 0.0, rope.unseen + elapsed)
     rope.adrift = np.where(seen, adrift, adrift + elapsed)
