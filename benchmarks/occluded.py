@@ -1,7 +1,7 @@
 """Motion capture seen past a curtain: frames, the truth, and what of it is seen. Used by persistence.py.
 
-As in mocap.py a tube round each curve is seen by a camera with a Kinect's noise. Before it a board as wide as a share of
-the rope, seen from the camera, goes to and fro over all of it. It comes in from beside the rope, so that the first
+As in mocap.py a tube round each curve is seen by a camera with a Kinect's noise. Before it a board as wide as a share
+of the rope, seen from the camera, goes to and fro over all of it. It comes in from beside the rope, so that the first
 frames see the whole of it, and crosses it in two seconds; both tips are hidden in turn.
 """
 

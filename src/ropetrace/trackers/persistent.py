@@ -19,13 +19,12 @@ from ropetrace.ordering import runs_backwards, starts_at_end
 from ropetrace.trackers.base import Lap, Mask, no_lap
 from ropetrace.trackers.clouds import arc_lengths, evenly_along, nearest_distances, nearest_nodes
 from ropetrace.trackers.doubts import KINK, Doubts, sharpest_turn
-from ropetrace.trackers.placement import Expected, Placed, place
+from ropetrace.trackers.placement import SAME_LENGTH, Expected, Placed, place
 from ropetrace.trackers.sight import is_behind, looked_through, sees_past
 from ropetrace.trackers.slicing import BRIDGE_DIAMETERS, SURFACE_NEIGHBOURS, SlicingTracker, too_little
 from ropetrace.trackers.strands import BREAK, Path, Strand, path_through, strand_of, strands_of
 from ropetrace.trackers.whole_rope import (
     MOST_SIGMA,
-    SAME_LENGTH,
     Laid,
     WholeRope,
     advance,
@@ -289,7 +288,7 @@ class PersistentTracker:
             return place(view.strands, expected, self.config.diameter)
         rope.other_length_for = 0.0
         view.strands = [whole]
-        return [Placed(whole, is_forwards, 0, 0, 0.0, whole.length)]
+        return [Placed(whole, is_forwards, 0, 0, 0.0, (True, True), whole.length)]
 
     def _whole(self, view: _View) -> Strand | None:
         """All that is seen as one strand, if it has no break and both ends are clear."""

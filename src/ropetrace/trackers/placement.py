@@ -21,6 +21,9 @@ from ropetrace.types import FloatArray
 _WORST = 9.0
 """A strand's misfit, squared and in standard deviations, saturates here: farther off is no worse."""
 
+SAME_LENGTH = 0.03
+"""A strand from end to end whose length differs by a smaller part from the rope's is the rope."""
+
 _SPREAD_COST = 1.4
 """What it costs to lie where the rope is e times less sure than where it is surest, in misfit."""
 
@@ -34,8 +37,11 @@ _NEAR_TIP, _NEAR_TIP_SHARE, _NEAR_TIP_SIGMAS = 5.0, 0.05, 3.0
 """How far from the rope's end a clear end may be placed and still be taken for it: diameters, parts of the length, and
 standard deviations of the prediction there. It is then put there."""
 
-_SHORT = 4.0
-"""A shorter strand is charged for its clear ends as if it were this long, diameters."""
+_SHORT, _LONG = 4.0, 12.0
+"""Shorter and longer strands are charged for such ends as if they were this long, diameters."""
+
+_AT_TIP = 1e-6
+"""A strand that is laid this close to an end of the rope ends there, metres."""
 
 _SLACK, _SLACK_SHARE = 2.0, 0.02
 """By how much strands may lie upon each other, or be farther apart than the rope allows: diameters and parts of the
@@ -99,6 +105,8 @@ class Placed:
         Which rope, and which of the given strands.
     start : float
         Where along the rope it begins, metres.
+    shows_ends : (start, end)
+        Whether its start and its end are those of the rope.
     gain : float
         Length that is explained, weighed by the fit, metres.
     """
@@ -108,6 +116,7 @@ class Placed:
     rope: int
     index: int
     start: float
+    shows_ends: tuple[bool, bool]
     gain: float
 
     @property
@@ -160,18 +169,19 @@ def _options(strand: Strand, index: int, rope: Expected, number: int, diameter: 
         laid = strand if sign > 0 else strand.reversed()
         start = float(offset if sign > 0 else offset - length)
         shift = _to_tip(laid, start, rope, diameter)
+        if shift is None and (misfit > _TOO_FAR or length < _room(rope, start + length / 2)):
+            continue
+        fit = misfit
         if shift:
             start += shift
             fit = _misfit(laid.nodes, laid.arc, 1.0, start, rope.nodes, rope.sigma, rope.spacing, rope.length)
-        elif shift is None and (misfit > _TOO_FAR or length < _room(rope, start + length / 2)):
-            continue
-        else:
-            fit = misfit
-        lost = _ends_lost(laid, start, rope, diameter)
-        gain = length * (_WORST - fit) - lost * _CLEAR_END_LOST * max(length, _SHORT * diameter)
+        ends = _shown_ends(laid, start, rope)
+        lost = sum(np.array(laid.clear) & ~np.array(ends) & np.array(rope.tips))
+        charged = min(max(length, _SHORT * diameter), _LONG * diameter)
+        gain = length * (_WORST - fit) - lost * _CLEAR_END_LOST * charged
         known = any(way.is_forwards == (sign > 0) and abs(way.start - start) < rope.spacing / 2 for way in ways)
         if gain > 0 and not known:
-            ways.append(Placed(laid, bool(sign > 0), number, index, start, float(gain)))
+            ways.append(Placed(laid, bool(sign > 0), number, index, start, ends, float(gain)))
     return ways
 
 
@@ -183,11 +193,12 @@ def _to_tip(strand: Strand, start: float, rope: Expected, diameter: float) -> fl
     return min(near, key=abs, default=None)
 
 
-def _ends_lost(strand: Strand, start: float, rope: Expected, diameter: float) -> int:
-    """How many clear ends of a strand lie in the middle of the rope."""
-    tips = near_tip(rope, diameter)
-    shifts = (start, rope.length - start - strand.length)
-    return sum(clear and abs(shift) >= tip > 0 for shift, clear, tip in zip(shifts, strand.clear, tips, strict=True))
+def _shown_ends(strand: Strand, start: float, rope: Expected) -> tuple[bool, bool]:
+    """Which ends of a strand that is laid there are those of the rope."""
+    after = rope.length - start - strand.length
+    if all(strand.clear) and abs(start) < _AT_TIP and abs(after) < 2 * SAME_LENGTH * rope.length:
+        return True, True
+    return strand.clear[0] and abs(start) < _AT_TIP, strand.clear[1] and abs(after) < _AT_TIP
 
 
 def _room(rope: Expected, place: float) -> float:
@@ -277,7 +288,8 @@ def _misfit(
 ) -> float:
     """Mean of the saturated squared distances of a strand, laid at offset + sign arc, from the expected rope.
 
-    Where nobody knows where the rope is, everything fits: as in a normal density, spread costs, against the surest node.
+    Where nobody knows where the rope is, everything fits. So spread costs, as in a normal density, against the surest
+    node's.
     """
     least = sigma[0]
     for m in range(len(sigma)):

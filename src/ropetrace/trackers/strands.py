@@ -29,8 +29,12 @@ _OVERLAP, _APART, _LATER = 1.2, 6.0, 3.5
 diameters. Which way the path goes on there is a guess."""
 
 
-_BEYOND = 3.0
+_BEYOND = 5.0
 """A strand that ends this close before another stretch, in diameters, may go on under it."""
+
+
+_SPREADING = 0.4
+"""How much farther aside that stretch may be for each metre ahead: the last slices of a strand do not point well."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,7 +195,7 @@ def _leads_to(others: FloatArray, end: FloatArray, before: FloatArray, diameter:
     steps = steps - (steps @ view)[:, None] * view
     ahead = steps @ outward
     aside = np.linalg.norm(steps - ahead[:, None] * outward, axis=1)
-    return bool(((ahead > 0) & (ahead < _BEYOND * diameter) & (aside < _OVERLAP * diameter)).any())
+    return bool(((ahead > 0) & (ahead < _BEYOND * diameter) & (aside < _OVERLAP * diameter + _SPREADING * ahead)).any())
 
 
 def strand_of(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ropetrace.centerline import SHORTEST_STEP, spline_at
 from ropetrace.trackers.clouds import evenly_along
 from ropetrace.trackers.hidden import fill_hidden
-from ropetrace.trackers.placement import Expected, Placed, near_tip
+from ropetrace.trackers.placement import SAME_LENGTH, Expected, Placed
 from ropetrace.trackers.sight import nearest_hidden
 from ropetrace.trackers.strands import Strand
 from ropetrace.types import FloatArray, Frame, Waypoints
@@ -49,8 +49,8 @@ _FRESH = 0.7
 _JOIN = 6.0
 """Strands that are closer than this along the rope, in diameters, are one: what lies between them is straight."""
 
-SAME_LENGTH = 0.03
-"""A strand from end to end whose length differs by a smaller part from the rope's is the rope."""
+_SLIP, _SLIP_SHARE = 3.0, 0.02
+"""By how much what lies between them may differ from the way along the rope: diameters and parts of its length."""
 
 _SLOWEST_LEARNING = 10
 """Whole views over which the length is averaged."""
@@ -194,37 +194,45 @@ class WholeRope:
 
 
 def laid_along(placed: list[Placed], rope: Expected, diameter: float) -> list[Laid]:
-    """Strands of one rope, joined where they follow closely, and stretched to the ends of the rope that are seen."""
-    trains: list[tuple[Strand, list[float], list[float], float]] = []
+    """Strands of one rope, joined where they follow closely, and stretched to the ends of the rope that they show."""
+    trains: list[list[Placed]] = []
     for one in placed:
-        if trains:
-            strand, starts, weights, end = trains[-1]
-            chord = float(np.linalg.norm(one.strand.nodes[0] - strand.nodes[-1]))
-            between = one.start + one.strand.reach[0] - end + strand.reach[1]
-            if chord < _JOIN * diameter and abs(between - chord) < 3 * diameter + 0.02 * rope.length:
-                joined = strand.joined(one.strand)
-                first = joined.length - one.strand.length
-                trains[-1] = joined, [*starts, one.start - first], [*weights, one.strand.length], one.end
-                continue
-        trains.append((one.strand, [one.start], [one.strand.length], one.end))
-    laid: list[Laid] = []
-    tips = near_tip(rope, diameter)
-    for index, (strand, starts, weights, _) in enumerate(trains):
-        start = float(np.average(starts, weights=weights))
-        scale = 1.0
-        at_start = index == 0 and strand.clear[0] and abs(start) < tips[0]
-        at_end = index == len(trains) - 1 and strand.clear[1] and abs(start + strand.length - rope.length) < tips[1]
-        if at_start and at_end and abs(strand.length / rope.length - 1) < 2 * SAME_LENGTH:
-            start, scale = 0.0, rope.length / strand.length
-        elif at_start and not (at_end and abs(start) > abs(start + strand.length - rope.length)):
-            start = 0.0
-        elif at_end:
-            start = rope.length - strand.length
+        if trains and _follows(trains[-1][-1], one, rope, diameter):
+            trains[-1].append(one)
         else:
-            start = min(start, rope.length - strand.length) if rope.tips[1] else start
-            start = max(start, 0.0) if rope.tips[0] else start
-        laid.append(Laid(strand, start, scale, at_start or at_end))
-    return laid
+            trains.append([one])
+    return [_laid(train, rope) for train in trains]
+
+
+def _follows(before: Placed, after: Placed, rope: Expected, diameter: float) -> bool:
+    """Whether the rope leads straight from one strand to the next."""
+    chord = float(np.linalg.norm(after.strand.nodes[0] - before.strand.nodes[-1]))
+    between = after.start + after.strand.reach[0] - before.end + before.strand.reach[1]
+    return chord < _JOIN * diameter and abs(between - chord) < _SLIP * diameter + _SLIP_SHARE * rope.length
+
+
+def _laid(train: list[Placed], rope: Expected) -> Laid:
+    strand = train[0].strand
+    starts = [train[0].start]
+    for one in train[1:]:
+        strand = strand.joined(one.strand)
+        starts.append(one.start - (strand.length - one.strand.length))
+    start = float(np.average(starts, weights=[one.strand.length for one in train]))
+    at_start, at_end = train[0].shows_ends[0], train[-1].shows_ends[1]
+    if at_start and at_end and abs(strand.length / rope.length - 1) < 2 * SAME_LENGTH:
+        return Laid(strand, 0.0, rope.length / strand.length, True)
+    if at_start and at_end:
+        # It cannot be both: what it is nearer to, it is.
+        at_start = abs(start) <= abs(start + strand.length - rope.length)
+        at_end = not at_start
+    if at_start:
+        start = 0.0
+    elif at_end:
+        start = rope.length - strand.length
+    else:
+        start = min(start, rope.length - strand.length) if rope.tips[1] else start
+        start = max(start, 0.0) if rope.tips[0] else start
+    return Laid(strand, start, 1.0, at_start or at_end)
 
 
 def advance(
