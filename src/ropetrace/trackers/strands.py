@@ -29,7 +29,7 @@ _OVERLAP, _APART, _LATER = 1.2, 6.0, 3.5
 diameters. Which way the path goes on there is a guess."""
 
 
-_BEYOND = 5.0
+_BEYOND = 6.0
 """A strand that ends this close before another stretch, in diameters, may go on under it."""
 
 
