@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from ropetrace.config import CenterlineConfig, OrderingConfig, RopeConfig, Segme
 from ropetrace.errors import ConfigError, FrameError
 from ropetrace.evaluation.metrics import coverage, distances_to_curve, symmetric_mean
 from ropetrace.sim.camera import Capsules, Plane
-from ropetrace.trackers import METHODS, SlicingTracker, make_tracker
+from ropetrace.trackers import METHODS, PersistentTracker, SlicingTracker, make_tracker
 from ropetrace.types import BadFrame, CloudFrame, Estimate, FloatArray, Intrinsics, RgbdFrame, Status
 
 ROPE = RopeConfig(diameter=0.012)
@@ -584,9 +585,10 @@ def test_the_papers_settings() -> None:
 
 
 def test_methods_are_found_by_name() -> None:
-    assert isinstance(make_tracker(ROPE), SlicingTracker)
-    assert next(iter(METHODS)) == "slicing"
-    with pytest.raises(ConfigError, match="method = 'magic': expected one of slicing"):
+    assert isinstance(make_tracker(ROPE), PersistentTracker)
+    assert isinstance(make_tracker(replace(ROPE, method="slicing")), SlicingTracker)
+    assert next(iter(METHODS)) == "persistent"
+    with pytest.raises(ConfigError, match="method = 'magic': expected one of persistent"):
         make_tracker(RopeConfig(diameter=0.01, method="magic"))
 
 

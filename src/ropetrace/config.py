@@ -258,7 +258,7 @@ class RopeConfig:
     """The rope's diameter, metres."""
     color: str | None = None
     """The rope's colour in full light, ``#rrggbb``."""
-    method: str = "slicing"
+    method: str = "persistent"
     """The tracker."""
     ropes: int | Literal["auto"] = 1
     """How many ropes are followed; ``"auto"`` for all that are seen. Only `persistent` follows more than one."""

@@ -92,7 +92,7 @@ class Case2Settings:
     longest: float = 60.0
     """A tracing that takes longer has failed, seconds."""
     noise: str = "none"
-    method: str = "slicing"
+    method: str = "persistent"
     self_filter: bool = True
     """Take the arm out of the image before tracking; a noisy sensor's depth bleeds from the hand into the rope."""
     latency: float | None = None

@@ -372,6 +372,9 @@ class PersistentTracker:
                 trouble.append(
                     "where the rope is expected there is nothing: it is somewhere else, or has lost its colour"
                 )
+        bridged = max((float(one.strand.widest_gap) for one in laid), default=0.0)
+        if bridged > BRIDGE_DIAMETERS * diameter:
+            trouble.append(f"a gap of {bridged * 1e3:.0f} mm is bridged")
         if sharpest_turn(chain) > KINK:
             trouble.append("the curve turns back sharply: the order there may be wrong")
         trouble += self._doubts.of_distance(chain)

@@ -73,6 +73,12 @@ class Strand:
         return cls(nodes, arc, float(arc[-1] + reach[1]), reach, clear, widths)
 
     @property
+    def widest_gap(self) -> float:
+        """The longest way between two of its nodes, beyond what is usual, metres."""
+        steps = np.diff(self.arc)
+        return float(steps.max() - np.median(steps))
+
+    @property
     def chain(self) -> FloatArray:
         """Its points from end to end, metres."""
         return extend_to_tips(self.nodes, self.reach)
