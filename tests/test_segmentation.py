@@ -345,3 +345,13 @@ def test_grey_does_not_pass_for_a_saturated_rope() -> None:
     greys = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
     gate = ColorGate.around_color((200, 40, 30), DEFAULT_TOLERANCE)
     assert not gate.accepts(greys[30:]).any()
+
+
+def test_a_joined_gate_accepts_what_either_accepts() -> None:
+    rng = np.random.default_rng(0)
+    colors = rng.integers(0, 256, (5000, 3), dtype=np.uint8)
+    red, blue = (ColorGate.around_color(rgb, DEFAULT_TOLERANCE) for rgb in ((200, 40, 30), (30, 60, 200)))
+    both = red.joined(blue)
+    assert (both.accepts(colors) == (red.accepts(colors) | blue.accepts(colors))).all()
+    assert red.accepts(colors).any()
+    assert blue.accepts(colors).any()

@@ -167,6 +167,12 @@ def _pixel(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
+def _ropes(text: str) -> int | str:
+    if text != AUTO and not text.isdecimal():
+        raise ConfigError(f"--ropes {text}: expected a number, or {AUTO}")
+    return AUTO if text == AUTO else int(text)
+
+
 def _print_contradictions(config: RopeConfig, frames: list[Frame]) -> None:
     from ropetrace.proposal import contradictions
 
@@ -179,7 +185,9 @@ class TrackedRope(Rope):
     """What is known of the rope, and what tracks it."""
 
     method: Annotated[str | None, arg(metavar="NAME")] = None
-    """The tracker: slicing (the default), schulman, cpd, gltp, spr, trackdlo or cdcpd."""
+    """The tracker: persistent (the default), slicing, schulman, cpd, gltp, spr, trackdlo or cdcpd."""
+    ropes: Annotated[str | None, arg(metavar="N|auto")] = None
+    """How many ropes are followed: 1 by default, or auto for all that are seen. With the method persistent alone."""
 
     def _given(self) -> dict[str, Any]:
-        return super()._given() | {"method": self.method}
+        return super()._given() | {"method": self.method, "ropes": None if self.ropes is None else _ropes(self.ropes)}

@@ -114,6 +114,8 @@ class SegmentationConfig:
 
     color_tolerance: float = 20.0
     """How far from the rope's colour, in full light or in its own shade, a pixel may lie: CIELAB units (delta E)."""
+    more_colors: tuple[str, ...] = ()
+    """Colours in full light of further ropes, ``#rrggbb``, beside `color`."""
     color_pixel: tuple[int, int] | None = None
     """Take the colour from this pixel (column, row) of the first frame, in the place of `color`."""
     lab_min: Vector | None = None
@@ -134,6 +136,8 @@ class SegmentationConfig:
             _finite(self.color_tolerance) and 0 < self.color_tolerance <= 200,
             f"segmentation.color_tolerance = {self.color_tolerance}: expected 0 to 200 CIELAB units",
         )
+        for color in self.more_colors:
+            parse_color(color)
         for name in ("lab", "box"):
             low, high = getattr(self, f"{name}_min"), getattr(self, f"{name}_max")
             _require(
@@ -290,6 +294,10 @@ class RopeConfig:
                 self.segmentation.lab_min is None and self.segmentation.color_pixel is None,
                 "color, segmentation.lab_min and segmentation.color_pixel each set the colour: give one of them",
             )
+        _require(
+            self.color is not None or not self.segmentation.more_colors,
+            "segmentation.more_colors stands beside color: give that, too",
+        )
         _require(
             self.ropes == "auto" or (isinstance(self.ropes, int) and 1 <= self.ropes <= MOST_ROPES),
             f'ropes = {self.ropes!r}: expected 1 to {MOST_ROPES}, or "auto"',

@@ -71,7 +71,7 @@ class ColorGate:
     """
 
     line: FloatArray
-    """(K, 3) vertices in CIELAB; for a box, its two corners."""
+    """(K, 3) vertices in CIELAB, NaN where one line ends and another begins; for a box, its two corners."""
     tolerance: float
     """CIELAB units; below 0 for a box."""
     verdicts: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(1 << 24, np.uint8))
@@ -87,6 +87,10 @@ class ColorGate:
         """
         shades = np.geomspace(DARKEST, brightest, 24)[:, None] * LINEAR_OF_SRGB[np.array(rgb)]
         return cls(lab_from_linear(shades), tolerance)
+
+    def joined(self, other: ColorGate) -> ColorGate:
+        """Accept what either of two gates round colours accepts; both must have the same tolerance."""
+        return ColorGate(np.concatenate([self.line, np.full((1, 3), np.nan), other.line]), self.tolerance)
 
     @classmethod
     def inside_lab_box(cls, low: tuple[float, float, float], high: tuple[float, float, float]) -> ColorGate:

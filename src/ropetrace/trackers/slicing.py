@@ -5,6 +5,8 @@ Rastegarpanah, Howard and Stolkin, "Tracking linear deformable objects using sli
 
 from __future__ import annotations
 
+from functools import reduce
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -258,7 +260,11 @@ def _scattered(points: int) -> str:
 def _color_gate(config: RopeConfig) -> ColorGate | None:
     segmentation: SegmentationConfig = config.segmentation
     if config.color is not None:
-        return ColorGate.around_color(parse_color(config.color), segmentation.color_tolerance)
+        gates = [
+            ColorGate.around_color(parse_color(color), segmentation.color_tolerance)
+            for color in (config.color, *segmentation.more_colors)
+        ]
+        return reduce(ColorGate.joined, gates)
     if segmentation.lab_min is not None and segmentation.lab_max is not None:
         return ColorGate.inside_lab_box(segmentation.lab_min, segmentation.lab_max)
     return None
