@@ -22,7 +22,7 @@ from ropetrace.trackers.doubts import KINK, Doubts, sharpest_turn
 from ropetrace.trackers.placement import SAME_LENGTH, Expected, Placed, place
 from ropetrace.trackers.sight import is_behind, looked_through, sees_past
 from ropetrace.trackers.slicing import BRIDGE_DIAMETERS, SURFACE_NEIGHBOURS, SlicingTracker, too_little
-from ropetrace.trackers.strands import BREAK, Path, Strand, path_through, strand_of, strands_of
+from ropetrace.trackers.strands import BREAK, Path, Strand, path_through, sliced_apart, strand_of, strands_of
 from ropetrace.trackers.whole_rope import (
     MOST_SIGMA,
     Laid,
@@ -37,8 +37,20 @@ from ropetrace.types import BadFrame, Cloud, Estimate, FloatArray, Frame, Status
 _OTHER_LENGTH_AFTER = 0.3
 """A clear strand of another length that is seen for longer than this is what the rope is, seconds."""
 
+_MISSING = 3.0
+"""A node that is farther than this from all that is seen is missing, diameters;"""
+
+_SEEN_MISSING = 0.7
+"""and a rope has got shorter if the camera looks through at least this share of the places where it is missing."""
+
 _AGREES = 1.5
 """A strand that may hold a wrong turn must lie this close to where the rope is expected, in standard deviations."""
+
+_LONGEST_PAUSE = 10.0
+"""A longer pause between two frames counts as this, seconds: clocks leap."""
+
+_LONGEST_FRAME = 0.1
+"""A frame speaks for no more than this of another length, seconds."""
 
 _ASTRAY_AFTER = 0.2
 """When most of what is seen has belonged to no rope for this long, the ropes may be anywhere near, seconds."""
@@ -55,6 +67,9 @@ _BEHIND = 0.7
 _SEEN_PAST = 0.3
 """Where the camera sees past a larger share of a gap, no rope goes over it."""
 
+_SMALLEST_GAP = 0.5
+"""Where there may be several ropes, one goes over a gap that is wider than this, in diameters, only straight on."""
+
 _STRAIGHT = 0.3
 """Cosine of the sharpest turn into and out of a gap that nothing hides."""
 
@@ -67,8 +82,8 @@ _ODD = 4.0
 _NEW_ROPE = 10.0
 """A strand that belongs to no rope must be this long to be another, diameters."""
 
-_POSITION_SIGMA = 0.05
-"""Standard deviation of what is seen, diameters: a floor, beside its own scatter."""
+_POSITION_SIGMA = 0.15
+"""Standard deviation of what is seen along each axis, diameters: most of it is where along the rope a point is."""
 
 
 @dataclass(slots=True, eq=False)
@@ -148,6 +163,9 @@ class PersistentTracker:
         lap("segmentation")
         view = _View(frame, points, count, stride, reasons)
         slices = self._slicing.slicer.slice(points)
+        if self.config.ropes != 1:
+            # One cut through several ropes can run along one of them.
+            slices = sliced_apart(points, slices, self._slicing.slicer, BREAK * self.config.diameter)
         lap("slicing")
         if slices.capped:
             reasons.append(
@@ -170,7 +188,7 @@ class PersistentTracker:
     def _elapsed(self, stamp_ns: int) -> float:
         """Seconds since the frame before; 0 where the stamps do not say."""
         before, self._stamp_ns = self._stamp_ns, stamp_ns
-        return 0.0 if before is None else max((stamp_ns - before) * 1e-9, 0.0)
+        return 0.0 if before is None else min(max((stamp_ns - before) * 1e-9, 0.0), _LONGEST_PAUSE)
 
     # --- the first view of a rope ---
 
@@ -204,8 +222,9 @@ class PersistentTracker:
         The path goes on over a gap if that is short, or if something nearer hides it.
         """
         diameter, slices = self.config.diameter, path.slices
+        least = BREAK if self.config.ropes == 1 else _SMALLEST_GAP
         pieces: list[list[NDArray[np.int64]]] = [[]]
-        for run in np.split(np.arange(len(slices)), np.flatnonzero(path.gaps > BRIDGE_DIAMETERS * diameter) + 1):
+        for run in np.split(np.arange(len(slices)), np.flatnonzero(path.gaps > least * diameter) + 1):
             if run[0] and not self._goes_on(path, int(run[0]), frame):
                 pieces.append([])
             pieces[-1].append(run)
@@ -272,6 +291,7 @@ class PersistentTracker:
     def _placed(self, view: _View, expected: list[Expected], elapsed: float) -> list[Placed]:
         whole = self._whole(view) if len(expected) == 1 else None
         if whole is None or view.path is None:
+            self._ropes[0].other_length_for = 0.0
             return place(view.strands, expected, self.config.diameter)
         # A rope that is seen from end to end needs no prediction but to tell its ends apart.
         rope = self._ropes[0]
@@ -279,16 +299,29 @@ class PersistentTracker:
         if not is_forwards:
             whole = whole.reversed()
         if abs(whole.length - rope.length) > SAME_LENGTH * rope.length + 2 * self.config.diameter:
-            rope.other_length_for += elapsed
-            if rope.views and (rope.other_length_for <= _OTHER_LENGTH_AFTER or view.path.unsure.any()):
+            if rope.views and not self._has_that_length(rope, whole, view, elapsed):
                 return place(view.strands, expected, self.config.diameter)
             rope.begin_again([Laid(whole, 0.0, 1.0, True)], self.config.diameter)
             expected[0] = rope.expected(0.0, self.config.diameter)
         elif view.path.unsure.any() and not _agrees(whole, expected[0]):
             return place(view.strands, expected, self.config.diameter)
         rope.other_length_for = 0.0
+        if not view.path.unsure.any():
+            rope.doubts = []
         view.strands = [whole]
         return [Placed(whole, is_forwards, 0, 0, 0.0, (True, True), whole.length)]
+
+    def _has_that_length(self, rope: WholeRope, whole: Strand, view: _View, elapsed: float) -> bool:
+        """Whether a rope has long been seen from end to end at another length, and nothing hides what is missing."""
+        if view.path is None or view.path.unsure.any():
+            return False
+        if whole.length < rope.length:
+            missing = rope.nodes[nearest_distances(rope.nodes, whole.nodes) > _MISSING * self.config.diameter]
+            if not len(missing) or looked_through(view.frame, missing, self.config.diameter).mean() < _SEEN_MISSING:
+                rope.other_length_for = 0.0
+                return False
+        rope.other_length_for += min(elapsed, _LONGEST_FRAME)
+        return rope.other_length_for > _OTHER_LENGTH_AFTER
 
     def _whole(self, view: _View) -> Strand | None:
         """All that is seen as one strand, if it has no break and both ends are clear."""

@@ -30,6 +30,9 @@ _SPREAD_COST = 1.4
 _TOO_FAR = 6.0
 """A strand without a clear end of the rope that misfits by more is not placed."""
 
+_FARTHEST = 7.4
+"""And one with a clear end is not, either, if it misfits by more than this: some four standard deviations."""
+
 _CLEAR_END_LOST = 2.3
 """What it costs if an end that is clear lies in the middle of the rope, in misfit: colour and depth have holes, too."""
 
@@ -175,6 +178,8 @@ def _options(strand: Strand, index: int, rope: Expected, number: int, diameter: 
         if shift:
             start += shift
             fit = _misfit(laid.nodes, laid.arc, 1.0, start, rope.nodes, rope.sigma, rope.spacing, rope.length)
+        if fit > _FARTHEST or length > _longest(rope, diameter):
+            continue
         ends = _shown_ends(laid, start, rope)
         lost = sum(np.array(laid.clear) & ~np.array(ends) & np.array(rope.tips))
         charged = min(max(length, _SHORT * diameter), _LONG * diameter)
@@ -183,6 +188,11 @@ def _options(strand: Strand, index: int, rope: Expected, number: int, diameter: 
         if gain > 0 and not known:
             ways.append(Placed(laid, bool(sign > 0), number, index, start, ends, float(gain)))
     return ways
+
+
+def _longest(rope: Expected, diameter: float) -> float:
+    """What a strand of a rope can be long, metres: no more than the rope, once both its ends have been seen."""
+    return (1 + 2 * SAME_LENGTH) * rope.length + _SLACK * diameter if all(rope.tips) else np.inf
 
 
 def _to_tip(strand: Strand, start: float, rope: Expected, diameter: float) -> float | None:

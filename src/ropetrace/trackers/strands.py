@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from ropetrace.axis import axis_points
 from ropetrace.centerline import SHORTEST_STEP, chain_tangents, extend_to_tips
 from ropetrace.ordering import NodeGraph, order_path
+from ropetrace.slicing import Slicer
 from ropetrace.trackers.clouds import arc_lengths
 from ropetrace.trackers.sight import is_clear
 from ropetrace.types import FloatArray, Frame, Slices
@@ -102,6 +104,45 @@ class Strand:
             (self.clear[0], after.clear[1]),
             np.concatenate([self.widths, after.widths]),
         )
+
+
+def sliced_apart(points: FloatArray, slices: Slices, slicer: Slicer, gap: float) -> Slices:
+    """The slices of each piece of a cloud that lies apart from the others, cut by itself.
+
+    Parameters
+    ----------
+    points : (3, N) float array
+        As the slicing sorted them, metres; they are sorted anew.
+    slices : Slices
+        Of the whole cloud.
+    slicer : Slicer
+        Cuts.
+    gap : float
+        Pieces with more free space than this between all of their slices are apart, metres.
+    """
+    if len(slices) < 2:
+        return slices
+    graph = NodeGraph.of(slices.centroids, slices.covariances)
+    count, piece = connected_components(graph.gaps <= gap, directed=False)
+    if count == 1:
+        return slices
+    clouds = []
+    for number in range(count):
+        ranges = zip(slices.starts[piece == number], slices.counts[piece == number], strict=True)
+        clouds.append(np.concatenate([points[:, start : start + size] for start, size in ranges], axis=1))
+    parts, at = [], 0
+    for cloud in clouds:
+        part = slicer.slice(cloud)
+        points[:, at : at + cloud.shape[1]] = cloud
+        parts.append(replace(part, starts=part.starts + at))
+        at += cloud.shape[1]
+    return Slices(
+        np.concatenate([part.centroids for part in parts]),
+        np.concatenate([part.covariances for part in parts]),
+        np.concatenate([part.counts for part in parts]),
+        any(part.capped for part in parts),
+        np.concatenate([part.starts for part in parts]),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

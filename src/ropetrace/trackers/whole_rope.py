@@ -59,6 +59,9 @@ _SLOWEST_LEARNING = 10
 _SHORTER = 10.0
 """A clear end that is seen this close to where an end was taken to be, in diameters, is that end."""
 
+_PER_AXIS = 0.4
+"""Standard deviation of what is hidden along each axis, in parts of what it is expected within (measured)."""
+
 _FARTHEST = 1e3
 """How far a rope is continued straight on, metres."""
 
@@ -95,7 +98,7 @@ class WholeRope:
     views : int
         How often both ends and all between them were seen, at most `_SLOWEST_LEARNING`.
     doubts : list of str
-        What was wrong with its start, until a whole view.
+        What was wrong with its start, until a view of the whole rope in which nothing overlaps.
     first : list of Laid
         The strands that it began with.
     surprise : float
@@ -139,8 +142,8 @@ class WholeRope:
         self.velocities = np.zeros_like(self.nodes)
         places = self.places
         seen = np.any([(places >= one.start) & (places <= one.end + 1e-9) for one in laid], axis=0)
-        self.unseen = np.where(seen, 0.0, MOST_SIGMA / _DRIFT)
-        self.adrift = self.unseen
+        self.unseen = np.zeros(count)
+        self.adrift = np.where(seen, 0.0, MOST_SIGMA / _DRIFT)
         self.tips = laid[0].strand.clear[0], laid[-1].strand.clear[1]
         self.views = int(len(laid) == 1 and all(self.tips))
 
@@ -190,7 +193,6 @@ class WholeRope:
         """Take the length of a view of the whole rope, metres."""
         self.views = min(self.views + 1, _SLOWEST_LEARNING)
         self.length += (length - self.length) / self.views
-        self.doubts = []
 
 
 def laid_along(placed: list[Placed], rope: Expected, diameter: float) -> list[Laid]:
@@ -356,7 +358,7 @@ def chain_of(rope: WholeRope, laid: list[Laid]) -> tuple[FloatArray, FloatArray,
 def told_of_waypoints(
     at: FloatArray, arc: FloatArray, is_seen: NDArray[np.bool_], rope: WholeRope, places: FloatArray
 ) -> tuple[NDArray[np.bool_], FloatArray]:
-    """Which waypoints are seen, and how far those that are not may have drifted, metres.
+    """Which waypoints are seen, and the standard deviation along each axis of those that are not, metres.
 
     Parameters
     ----------
@@ -369,8 +371,8 @@ def told_of_waypoints(
     seen = is_seen[after] & is_seen[after - 1]
     unseen = np.interp(np.interp(at, arc, places), rope.places, rope.unseen)
     if not seen.any():
-        return seen, np.minimum(_DRIFT * unseen, MOST_SIGMA)
+        return seen, _PER_AXIS * np.minimum(_DRIFT * unseen, MOST_SIGMA)
     shown = at[seen]
     right = np.clip(np.searchsorted(shown, at), 0, len(shown) - 1)
     away = np.minimum(np.abs(at - shown[right]), np.abs(at - shown[np.maximum(right - 1, 0)]))
-    return seen, np.minimum(np.minimum(_DRIFT * unseen, MOST_SIGMA), away)
+    return seen, _PER_AXIS * np.minimum(np.minimum(_DRIFT * unseen, MOST_SIGMA), away)
