@@ -43,6 +43,9 @@ _MEMORY = 0.15
 _HIDDEN_MEMORY = 0.06
 """and one that is hidden: nobody knows what holds it."""
 
+_FRESH = 0.7
+"""Weight of the newest difference in the velocity of a node that is seen."""
+
 _JOIN = 6.0
 """Strands that are closer than this along the rope, in diameters, are one: what lies between them is straight."""
 
@@ -273,11 +276,15 @@ def advance(
     else:
         targets, pushed = nearest_hidden(frame, expected.nodes, diameter)
         nodes = fill_hidden(expected.nodes, seen, measured, pushed, targets, rope.spacing, diameter)
-    follows = seen & (rope.unseen == 0)
     if elapsed > 0:
         difference = (nodes - rope.nodes) / elapsed
-        fading = np.where(seen[:, None], rope.velocities, difference * np.exp(-elapsed / _HIDDEN_MEMORY))
-        rope.velocities = np.where(follows[:, None], difference, fading)
+        follows = seen & (rope.unseen == 0)
+        rope.velocities = np.where(
+            follows[:, None],
+            rope.velocities + _FRESH * (difference - rope.velocities),
+            np.where(seen[:, None], rope.velocities, difference * np.exp(-elapsed / _HIDDEN_MEMORY)),
+        )
+    follows = seen & (rope.unseen == 0)
     if follows.any():
         off = float(np.sqrt(np.mean(np.sum((nodes - expected.nodes)[follows] ** 2, axis=1))))
         rope.surprise = max(off, _CALMING * rope.surprise)
