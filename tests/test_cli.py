@@ -26,7 +26,7 @@ from ropetrace.recordings.mcap_file import McapFrameWriter
 from ropetrace.recordings.rgbd_folder import RgbdFolderWriter
 from ropetrace.results.base import COLUMNS
 from ropetrace.sim.camera import Capsules, RayCaster, Scene
-from ropetrace.terminal import INTERRUPTED
+from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, NOTHING_FOUND
 from ropetrace.types import Intrinsics, RgbdFrame
 
 CAMERA = Intrinsics(160, 120, 145.0, 145.0, 79.5, 59.5)
@@ -193,7 +193,7 @@ def test_predicted_results(run: Run, folder: Path, tmp_path: Path) -> None:
 def test_nothing_is_predicted_without_the_motion(run: Run, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "rope.toml").write_text(f'diameter = "24mm"\ncolor = "{COLOR}"\n[motion]\nmethod = "none"\n')
     code, _, err = run("track", folder, "--config", "rope.toml", "--predict", "40ms", "--out", "r.csv")
-    assert code == cli.BAD_INPUT
+    assert code == BAD_INPUT
     assert "--predict needs the motion" in err
     assert 'motion.method = "none"' in err
     assert run("track", folder, "--config", "rope.toml", "--out", "r.csv")[0] == 0
@@ -205,7 +205,7 @@ def test_a_mask_replaces_the_colour(run: Run, tmp_path: Path) -> None:
     Image.fromarray(np.full((120, 160), 255, np.uint8)).save(tmp_path / "mask.png")
     Image.fromarray(np.zeros((120, 160), np.uint8)).save(tmp_path / "nothing.png")
     assert run("track", "rope", "-d", "24mm", "--mask", "mask.png", "--out", "r.csv")[0] == 0
-    assert run("track", "rope", "-d", "24mm", "--mask", "nothing.png", "--out", "none.csv")[0] == cli.NOTHING_FOUND
+    assert run("track", "rope", "-d", "24mm", "--mask", "nothing.png", "--out", "none.csv")[0] == NOTHING_FOUND
     assert set(statuses(tmp_path / "none.csv").values()) == {"lost"}
 
 
@@ -284,7 +284,7 @@ def test_a_users_mistake_gets_one_clear_line(
 ) -> None:
     (tmp_path / "empty").mkdir()
     code, _, err = run(*[a.format(folder=folder, empty=tmp_path / "empty") for a in arguments])
-    assert code == cli.BAD_INPUT
+    assert code == BAD_INPUT
     assert err.startswith("ropetrace: ")
     assert err.count("\n") == 1
     for word in words:
@@ -294,7 +294,7 @@ def test_a_users_mistake_gets_one_clear_line(
 def test_an_unknown_setting_is_named_with_the_nearest(run: Run, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "rope.toml").write_text('diameter = "12mm"\n[segmentation]\ncolour_tolerance = 10\n')
     code, _, err = run("track", folder, "--config", "rope.toml")
-    assert code == cli.BAD_INPUT
+    assert code == BAD_INPUT
     assert "segmentation.colour_tolerance" in err
     assert "did you mean segmentation.color_tolerance" in err
 
@@ -302,7 +302,7 @@ def test_an_unknown_setting_is_named_with_the_nearest(run: Run, folder: Path, tm
 def test_existing_results_are_kept(run: Run, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "r.csv").write_text("precious")
     code, _, err = run("track", folder, "-d", "24mm", "-c", COLOR, "--out", "r.csv")
-    assert code == cli.BAD_INPUT
+    assert code == BAD_INPUT
     assert "--overwrite" in err
     assert (tmp_path / "r.csv").read_text() == "precious"
     assert run("track", folder, "-d", "24mm", "-c", COLOR, "--out", "r.csv", "--overwrite")[0] == 0
@@ -314,7 +314,7 @@ def test_no_output_may_be_the_input(run: Run, tmp_path: Path) -> None:
     (tmp_path / "link.mcap").hardlink_to(path)
     for name in ("rope.mcap", "./rope.mcap", "link.mcap"):
         code, _, err = run("track", path, "-d", "24mm", "-c", COLOR, "--out", name, "--overwrite")
-        assert code == cli.BAD_INPUT
+        assert code == BAD_INPUT
         assert "input" in err
     assert path.read_bytes() == whole
 
@@ -322,28 +322,28 @@ def test_no_output_may_be_the_input(run: Run, tmp_path: Path) -> None:
 def test_an_output_in_the_recordings_folder_replaces_nothing(run: Run, folder: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(folder, tmp_path / "rope")
     (copy / "notes.csv").write_text("precious")
-    assert run("track", copy, "-d", "24mm", "-c", COLOR, "--out", copy / "notes.csv", "--overwrite")[0] == cli.BAD_INPUT
+    assert run("track", copy, "-d", "24mm", "-c", COLOR, "--out", copy / "notes.csv", "--overwrite")[0] == BAD_INPUT
     assert (copy / "notes.csv").read_text() == "precious"
 
 
 def test_outputs_are_checked_before_any_is_made(run: Run, folder: Path, tmp_path: Path) -> None:
     for second in ("bad.xyz", "r.csv", "./r.csv", "no/place.csv"):
-        assert run("track", folder, "-d", "24mm", "-c", COLOR, "--out", "r.csv", second)[0] == cli.BAD_INPUT
+        assert run("track", folder, "-d", "24mm", "-c", COLOR, "--out", "r.csv", second)[0] == BAD_INPUT
         assert not (tmp_path / "r.csv").exists()
     (tmp_path / "r.csv.toml").write_text("precious")
-    assert run("track", folder, "-d", "24mm", "-c", COLOR, "--out", "r.csv")[0] == cli.BAD_INPUT
+    assert run("track", folder, "-d", "24mm", "-c", COLOR, "--out", "r.csv")[0] == BAD_INPUT
     assert (tmp_path / "r.csv.toml").read_text() == "precious"
 
 
 def test_the_doctor_keeps_pictures_that_exist(run: Run, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.png").write_text("precious")
-    assert run("doctor", folder, "-d", "24mm", "-c", COLOR, "--picture", "mine.png")[0] == cli.BAD_INPUT
+    assert run("doctor", folder, "-d", "24mm", "-c", COLOR, "--picture", "mine.png")[0] == BAD_INPUT
     assert (tmp_path / "mine.png").read_text() == "precious"
 
 
 def test_a_start_beyond_the_end_is_told(run: Run, folder: Path) -> None:
     code, _, err = run("track", folder, "-d", "24mm", "-c", COLOR, "--start", 50)
-    assert code == cli.NOTHING_FOUND
+    assert code == NOTHING_FOUND
     assert "--start 50" in err
 
 
@@ -375,7 +375,7 @@ def test_names_that_the_terminal_cannot_show(folder: Path, tmp_path: Path) -> No
 def test_no_colour_where_a_colour_is_asked_for(run: Run, tmp_path: Path) -> None:
     write_folder(tmp_path / "rope", rope_frames(color=False))
     code, _, err = run("track", "rope", "-d", "24mm", "-c", COLOR, "--out", "r.csv")
-    assert code == cli.BAD_INPUT
+    assert code == BAD_INPUT
     assert "colour" in err
     assert not (tmp_path / "r.csv").exists(), "nothing is left behind that would stop the next try"
 
@@ -435,7 +435,7 @@ def test_a_truncated_bag_is_used_up_to_the_damage(run: Run, tmp_path: Path) -> N
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) * 6 // 10])
     code, out, err = run("track", path, "-d", "24mm", "-c", COLOR, "--out", "r.csv")
-    assert code == cli.DAMAGED
+    assert code == DAMAGED
     assert "damage" in out
     assert "lost" in err
     found = statuses(tmp_path / "r.csv")
@@ -449,7 +449,7 @@ def test_a_flipped_bit_in_a_bag_is_told(run: Run, tmp_path: Path) -> None:
     data[len(data) // 2] ^= 4
     path.write_bytes(data)
     code, out, _ = run("track", path, "-d", "24mm", "-c", COLOR, "--out", "r.csv")
-    assert code == cli.DAMAGED
+    assert code == DAMAGED
     assert "damage" in out
     assert len(statuses(tmp_path / "r.csv")) >= 5
 
@@ -471,10 +471,10 @@ def test_stamps_that_repeat_and_run_back(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("points", "code"),
     [
-        (np.empty((0, 3)), cli.NOTHING_FOUND),
-        (np.ones((1, 3)), cli.NOTHING_FOUND),
-        (np.full((500, 3), np.nan), cli.NOTHING_FOUND),
-        (np.ones((500, 3)), cli.NOTHING_FOUND),
+        (np.empty((0, 3)), NOTHING_FOUND),
+        (np.ones((1, 3)), NOTHING_FOUND),
+        (np.full((500, 3), np.nan), NOTHING_FOUND),
+        (np.ones((500, 3)), NOTHING_FOUND),
     ],
     ids=["empty", "one point", "all NaN", "coincident"],
 )
@@ -504,7 +504,7 @@ def test_info_lists_streams_and_damage(run: Run, folder: Path, tmp_path: Path) -
     path = write_mcap(tmp_path / "rope.mcap", rope_frames(20))
     path.write_bytes(path.read_bytes()[:-3000])
     code, out, _ = run("info", path)
-    assert code == cli.DAMAGED
+    assert code == DAMAGED
     assert "damage" in out
 
 
@@ -512,7 +512,7 @@ def test_info_says_what_it_found_instead(run: Run, tmp_path: Path) -> None:
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "readme.txt").write_text("hello")
     code, _, err = run("info", "notes")
-    assert code == cli.BAD_INPUT
+    assert code == BAD_INPUT
     assert "readme.txt" in err
 
 

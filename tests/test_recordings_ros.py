@@ -149,7 +149,7 @@ def test_mcap_writer_refuses(tmp_path: Path) -> None:
         McapFrameWriter(tmp_path / "old.mcap", CAMERA_8X6, 0.001)
     with pytest.raises(OutputError, match="millimetres"):
         McapFrameWriter(tmp_path / "a.mcap", CAMERA_8X6, 0.002)
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="does not exist"):
         McapFrameWriter(tmp_path / "none" / "a.mcap", CAMERA_8X6, 0.001)
     frame = make_frames(1)[0]
     with McapFrameWriter(tmp_path / "b.mcap", CAMERA_8X6, 0.001) as writer:

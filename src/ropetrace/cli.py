@@ -17,20 +17,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, arg
 
+from ropetrace.cli_batch import Batch
 from ropetrace.cli_compare import Compare
+from ropetrace.cli_node import Node
+from ropetrace.cli_record import Record, Recover
 from ropetrace.cli_simulation import Reproduce, Simulate, parse_duration
 from ropetrace.cli_source import Part, Source, TrackedRope
 from ropetrace.cli_trace import Trace
+from ropetrace.cli_tune import Tune
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
-from ropetrace.terminal import INTERRUPTED, progress_bar
+from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND, progress_bar
 
 if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
     from ropetrace.recordings import Recording
-
-BAD_INPUT, NOTHING_FOUND, DAMAGED = 2, 1, 3
-"""Exit codes: what was given is wrong; no frame gave an estimate; part of the recording was lost."""
-
 
 _DOCTOR_PICTURE = Path("ropetrace-doctor.png")
 
@@ -90,7 +90,7 @@ class Track:
     """The frame of the results; world needs camera_pose in the config."""
     predict: Annotated[str | None, arg(metavar="now|DURATION")] = None
     """Write the centreline of a later time than the frame's stamp: a duration such as 40ms, or now, the moment at which
-    the frame has been worked on, as if it came at its stamp."""
+    the frame has been worked on; frames of a recording count as if they came at their stamps."""
     view: bool = False
     """Show it live in the Rerun viewer."""
     overwrite: bool = False
@@ -194,10 +194,15 @@ def main() -> None:
     command = tyro.cli(
         Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Track, tyro.conf.subcommand("track")]
+        | Annotated[Batch, tyro.conf.subcommand("batch")]
+        | Annotated[Record, tyro.conf.subcommand("record")]
+        | Annotated[Recover, tyro.conf.subcommand("recover")]
         | Annotated[Info, tyro.conf.subcommand("info")]
         | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+        | Annotated[Tune, tyro.conf.subcommand("tune")]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
         | Annotated[Trace, tyro.conf.subcommand("trace")]
+        | Annotated[Node, tyro.conf.subcommand("node")]
         | Annotated[Compare, tyro.conf.subcommand("compare")]
         | Annotated[Reproduce, tyro.conf.subcommand("reproduce")],  # type: ignore[arg-type]
         prog="ropetrace",
@@ -225,12 +230,8 @@ def main() -> None:
     sys.exit(code)
 
 
-_INTERRUPTS: list[int] = []
-"""Signals that came. The exception alone is not enough: raised inside the compiler's callbacks it is swallowed."""
-
-
 def _interrupt(number: int, frame: object) -> None:
-    _INTERRUPTS.append(number)
+    INTERRUPTS.append(number)
     raise KeyboardInterrupt
 
 
@@ -250,8 +251,10 @@ def _track(
     extra_sinks: list[Any] | None = None,
     inputs: list[Path] | None = None,
 ) -> int:
+    from ropetrace.live import LiveRecording
     from ropetrace.motion import make_motion
     from ropetrace.picture import ContactSheet
+    from ropetrace.recordings.base import has_color
     from ropetrace.results import check_outputs, open_writer
     from ropetrace.trackers import make_tracker
     from ropetrace.tracking import track_recording
@@ -260,12 +263,13 @@ def _track(
         raise ConfigError("--frame world needs camera_pose in the config")
     if picture is not None and frame == "world":
         raise ConfigError("--picture draws in the camera's frame: leave out --frame world")
-    sources = [recording.path, *(inputs or [])]
+    live = recording if isinstance(recording, LiveRecording) else None
+    sources = [*([] if live else [recording.path]), *(inputs or [])]
     check_outputs(outputs, overwrite, sources)
     for path in [_settings_of(path) for path in outputs] + ([] if picture is None else [picture]):
         if path.exists() and (not overwrite or any(path.samefile(source) for source in sources)):
             raise OutputError(f"{path} exists already: choose another name or give --overwrite")
-    if config.asks_for_color and mask is None and not _has_color(recording, start):
+    if config.asks_for_color and mask is None and not has_color(recording, start):
         raise ConfigError("a colour is asked for, but the recording has none: leave out the colour, or record it")
     tracker = make_tracker(config, None if mask is None else _mask(mask))
     resolved = config.resolved().to_toml()
@@ -291,6 +295,8 @@ def _track(
         if contact is not None:
             sinks.append(contact)
         sinks += extra_sinks or []
+        if live is not None:
+            stack.callback(live.close)
         total = None if recording.frame_count is None else max(recording.frame_count - start, 0)
         if limit is not None:
             total = limit if total is None else min(total, limit)
@@ -304,19 +310,21 @@ def _track(
                 first_index=start,
                 world_from_camera=pose,
                 wants_cloud=view or any(path.suffix.lower() == ".rrd" for path in outputs),
+                age=None if live is None else live.age,
                 on_frame=lambda estimate: advance(str(estimate.status)),
-                should_stop=lambda: bool(_INTERRUPTS),
+                should_stop=lambda: bool(INTERRUPTS),
             )
     if contact is not None:
         contact.save()
-    print("\n".join(summary.lines()))
+    print("\n".join(summary.lines() + ([] if live is None else live.lines())))
     for problem in recording.problems:
         print(f"damage    {problem}")
     for path in outputs:
         print(f"written   {path} (settings: {path.name}.toml)")
     if viewer is not None and viewer.skipped:
         print(f"viewer    skipped {viewer.skipped} frames to keep up")
-    if summary.interrupted:
+    # A live source has no other end.
+    if summary.interrupted and live is None:
         print("ropetrace: interrupted; what was tracked until then is written", file=sys.stderr)
         return INTERRUPTED
     if recording.problems:
@@ -365,16 +373,6 @@ def _prediction(text: str | None, config: RopeConfig) -> float | Literal["now"]:
     if not 0 <= seconds <= LONGEST_PREDICTION:
         raise ConfigError(f"--predict {text}: expected 0 to {LONGEST_PREDICTION:g} s")
     return seconds
-
-
-def _has_color(recording: Recording, start: int) -> bool:
-    """Whether the first sound frame has colour; true if there is no sound frame, which shows later."""
-    from ropetrace.types import BadFrame, lacks_color
-
-    for event in recording.frames(start, 50):
-        if not isinstance(event, BadFrame):
-            return not lacks_color(event)
-    return True
 
 
 def _settings_of(path: Path) -> Path:

@@ -51,11 +51,17 @@ class Part:
         if self.limit is not None and not 1 <= self.limit <= _MOST_FRAMES:
             raise ConfigError(f"--limit {self.limit}: expected 1 to {_MOST_FRAMES}")
 
-    def open(self, recording: Path) -> Recording:
-        """Open a recording."""
+    def open(self, recording: Path, live: bool = False) -> Recording:
+        """Open a recording, or a live source if that may be."""
+        from ropetrace.live import scheme_of
         from ropetrace.recordings import open_recording
 
         self.check()
+        if scheme_of(recording) is not None:
+            if not live:
+                raise ConfigError(f"{recording}: a live source is never twice the same: give a recording")
+            if self.start:
+                raise ConfigError(f"--start {self.start}: a live source begins when it is opened: leave out --start")
         return open_recording(
             recording,
             rate=self.rate,
@@ -71,12 +77,12 @@ class Source:
 
     recording: Annotated[Path, tyro.conf.Positional, arg(metavar="RECORDING")]
     """An RGB-D folder, a ROS 2 bag (.mcap, .db3, or their folder), a ROS 1 .bag, or point clouds (a folder of .npy,
-    .npz, .ply, .pcd, or one of them)."""
+    .npz, .ply, .pcd, or one of them). Live: sim:SCENARIO, realsense: or realsense:SERIAL."""
     part: OmitArgPrefixes[Part]
 
     def open(self) -> Recording:
         """Open the recording."""
-        return self.part.open(self.recording)
+        return self.part.open(self.recording, live=True)
 
     def first_frames(self) -> list[Frame]:
         """The first frames of the part, without bad ones."""

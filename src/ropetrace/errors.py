@@ -26,6 +26,10 @@ class OutputError(RopetraceError):
     """A result cannot be written."""
 
 
+class RosError(RopetraceError):
+    """The live ROS graph cannot be joined as it was asked for."""
+
+
 class MissingExtraError(RopetraceError):
     """A feature needs an optional dependency that is not installed."""
 

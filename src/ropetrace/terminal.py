@@ -5,8 +5,11 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C."""
+NOTHING_FOUND, BAD_INPUT, DAMAGED, INTERRUPTED = 1, 2, 3, 130
+"""Exit codes: no frame gave an estimate; what was given is wrong; part of the recording was lost; after Ctrl-C."""
+
+INTERRUPTS: list[int] = []
+"""Signals that came. The exception alone is not enough: raised inside the compiler's callbacks it is swallowed."""
 
 
 def progress_bar(total: int | None, unit: str) -> Any:

@@ -6,6 +6,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -77,6 +78,7 @@ class Summary:
     frames: int = 0
     ropes: dict[int, RopeSummary] = field(default_factory=lambda: defaultdict(RopeSummary))
     stage_seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    latency_seconds: list[float] = field(default_factory=list)
     interrupted: bool = False
 
     def add(self, *estimates: Estimate) -> None:
@@ -111,6 +113,9 @@ class Summary:
             lines.append(
                 f"          without the first two frames, which took {first:.2f} s with the start of the kernels"
             )
+        if self.latency_seconds:
+            p50, p99 = np.percentile(np.array(self.latency_seconds[2:] or self.latency_seconds) * 1e3, [50, 99])
+            lines.append(f"latency   from the stamp to the estimate: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
         return lines
 
 
@@ -129,6 +134,7 @@ def track_recording(
     first_index: int = 0,
     world_from_camera: FloatArray | None = None,
     wants_cloud: bool = False,
+    age: Callable[[], float] | None = None,
     on_frame: Callable[[Estimate], None] | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Summary:
@@ -146,14 +152,17 @@ def track_recording(
         Gives the waypoints their velocities and accelerations. Where there are several ropes: what makes an estimator,
         called once for each.
     predict : float or "now"
-        Hand on the centreline of this many seconds after the frame's stamp, or, as if the frame came at its stamp, of
-        the moment at which it is handed on: then the results depend on how fast this machine was.
+        Hand on the centreline of this many seconds after the frame's stamp, or of the moment at which it is handed on,
+        by `age`: then the results depend on how fast this machine was.
     first_index : int
         Index of the first frame in its recording.
     world_from_camera : (4, 4) float array, optional
         Hand the estimates on in the world's frame.
     wants_cloud : bool
         Whether the sinks are given the points and their nodes.
+    age : callable, optional
+        Seconds since the stamp of the frame that was read last, for a live source; kept in the summary. Without it,
+        frames count as if they came at their stamps.
     on_frame : callable, optional
         Told of the first estimate of each frame, for a progress bar.
     should_stop : callable
@@ -186,12 +195,17 @@ def track_recording(
                 break
             watch.lap("read")
             came = time.perf_counter()
-            estimates = _estimates(event, tracker, watch, sorted(summary.ropes) or [0])
+            seconds_old = age or partial(_seconds_since, came)
+            estimates = estimates_of(event, tracker, sorted(summary.ropes) or [0], watch.lap)
             if motion is not None:
-                estimates = tuple(_moving(estimate, motions.of(estimate.rope), predict, came) for estimate in estimates)
+                estimates = tuple(
+                    _moving(estimate, motions.of(estimate.rope), predict, seconds_old) for estimate in estimates
+                )
                 watch.lap("motion")
             if world_from_camera is not None:
                 estimates = tuple(in_world(estimate, world_from_camera) for estimate in estimates)
+            if age is not None and not isinstance(event, BadFrame):
+                summary.latency_seconds.append(age())
             cloud = tracker.cloud() if wants_cloud and not isinstance(event, BadFrame) else None
             if cloud is not None and world_from_camera is not None:
                 cloud = Cloud(moved(cloud.points, world_from_camera), cloud.node)
@@ -228,15 +242,22 @@ class _Motions:
 
 
 def _moving(
-    estimate: Estimate, motion: MotionEstimator | None, predict: float | Literal["now"], came: float
+    estimate: Estimate,
+    motion: MotionEstimator | None,
+    predict: float | Literal["now"],
+    seconds_old: Callable[[], float],
 ) -> Estimate:
-    """The estimate with its motion, predicted if that is asked for; `came` is when its frame came, in seconds."""
+    """The estimate with its motion, predicted if that is asked for."""
     if motion is None:
         return estimate
     estimate = with_motion(estimate, motion)
     if not predict:
         return estimate
-    return ahead_of_time(estimate, motion, time.perf_counter() - came if predict == "now" else predict)
+    return ahead_of_time(estimate, motion, seconds_old() if predict == "now" else predict)
+
+
+def _seconds_since(came: float) -> float:
+    return time.perf_counter() - came
 
 
 def with_motion(estimate: Estimate, motion: MotionEstimator) -> Estimate:
@@ -271,12 +292,12 @@ def in_world(estimate: Estimate, world_from_camera: FloatArray) -> Estimate:
     )
 
 
-def _estimates(event: Event, tracker: Tracker, watch: _Stopwatch, ropes: list[int]) -> tuple[Estimate, ...]:
+def estimates_of(event: Event, tracker: Tracker, ropes: list[int], lap: Lap = no_lap) -> tuple[Estimate, ...]:
     """The estimate of each rope; `ropes` are those so far, all lost in a frame that cannot be used."""
     try:
         if isinstance(tracker, RopesTracker):
-            return tracker.update_all(event, watch.lap)
-        return (tracker.update(event, watch.lap),)
+            return tracker.update_all(event, lap)
+        return (tracker.update(event, lap),)
     except FrameError as error:
         return tuple(Estimate.lost(event.stamp_ns, str(error), rope=rope) for rope in ropes)
 

@@ -32,6 +32,78 @@ SomeRun = TypeVar("SomeRun", bound=Named)
 Result = TypeVar("Result")
 
 
+class SettingsFile:
+    """`settings.toml` of a folder: what all runs that are kept in it depend on.
+
+    Parameters
+    ----------
+    folder : Path
+        It need not exist.
+    command : str
+        Of `ropetrace`, whose runs they are.
+    """
+
+    def __init__(self, folder: Path, command: str) -> None:
+        self._folder = folder
+        self._command = command
+        self._path = folder / "settings.toml"
+
+    def measured(self, settings: Mapping[str, Any]) -> dict[str, float]:
+        """What was measured before the runs that are in the folder; nothing if there are none.
+
+        Parameters
+        ----------
+        settings : mapping
+            Those of the runs that are to join them.
+
+        Raises
+        ------
+        ConfigError
+            If the runs have other settings.
+        OutputError
+            If the folder holds something else.
+        """
+        folder = self._folder
+        with writing(folder):
+            if folder.exists() and not folder.is_dir():
+                raise OutputError(f"{folder} is a file: give the name of a folder")
+            if not self._path.exists():
+                if folder.exists() and any(folder.iterdir()):
+                    raise OutputError(
+                        f"{folder} holds other things, and no settings.toml: choose another --out, "
+                        "or give --overwrite to write among them"
+                    )
+                return {}
+        table = read_toml(self._path)
+        times = table.pop("compute_time", {})
+        before, now = _flat(table), _flat(tomllib.loads(_toml(_with_version(settings))))
+        for name in {**now, **before}:
+            if before.get(name) != now.get(name):
+                was, is_now = (_shown(values.get(name)) for values in (before, now))
+                raise ConfigError(
+                    f"{folder} was begun with other settings ({name}: {was}, now {is_now}): choose another --out, "
+                    "or give --overwrite to begin anew"
+                )
+        if not isinstance(times, dict) or not all(isinstance(value, float) for value in times.values()):
+            raise ConfigError(f"{self._path}: [compute_time] does not hold seconds: give --overwrite")
+        return times
+
+    def write(self, settings: Mapping[str, Any], measured: Mapping[str, float] | None = None) -> None:
+        """Write it: what is None is left out."""
+        lines = [
+            f"# Of `ropetrace {self._command}`. A run with other settings needs another folder.",
+            _toml(_with_version(settings)),
+        ]
+        if measured:
+            lines += [
+                "",
+                "# From a frame's arrival to its centreline, simulated seconds; measured once, then applied to all.",
+                "[compute_time]",
+                *(f"{name} = {value!r}" for name, value in sorted(measured.items())),
+            ]
+        replace_file(self._path, ("\n".join(lines) + "\n").encode())
+
+
 class RunFolder(Generic[SomeRun, Result]):
     """Where runs are kept: `settings.toml`, and a file for each run that is finished.
 
@@ -51,9 +123,8 @@ class RunFolder(Generic[SomeRun, Result]):
         self.path = path
         self._result = result
         self._arrays = [item.name for item in fields(cast(Any, result))]
-        self._command = command
         self._files = path / inner
-        self._settings_path = path / "settings.toml"
+        self._settings = SettingsFile(path, command)
 
     def measured(self, settings: Mapping[str, Any]) -> dict[str, float]:
         """What was measured before the runs that are in the folder; nothing if there are none.
@@ -70,29 +141,7 @@ class RunFolder(Generic[SomeRun, Result]):
         OutputError
             If the folder holds something else.
         """
-        with writing(self.path):
-            if self.path.exists() and not self.path.is_dir():
-                raise OutputError(f"{self.path} is a file: give the name of a folder")
-            if not self._settings_path.exists():
-                if self.path.exists() and any(self.path.iterdir()):
-                    raise OutputError(
-                        f"{self.path} holds other things, and no settings.toml: choose another --out, "
-                        "or give --overwrite to write among them"
-                    )
-                return {}
-        table = read_toml(self._settings_path)
-        times = table.pop("compute_time", {})
-        before, now = _flat(table), _flat(tomllib.loads(_toml(_with_version(settings))))
-        for name in {**now, **before}:
-            if before.get(name) != now.get(name):
-                was, is_now = (_shown(values.get(name)) for values in (before, now))
-                raise ConfigError(
-                    f"{self.path} was begun with other settings ({name}: {was}, now {is_now}): choose another --out, "
-                    "or give --overwrite to begin anew"
-                )
-        if not isinstance(times, dict) or not all(isinstance(value, float) for value in times.values()):
-            raise ConfigError(f"{self._settings_path}: [compute_time] does not hold seconds: give --overwrite")
-        return times
+        return self._settings.measured(settings)
 
     def begin(
         self, settings: Mapping[str, Any], measured: Mapping[str, float] | None = None, overwrite: bool = False
@@ -122,18 +171,7 @@ class RunFolder(Generic[SomeRun, Result]):
             if overwrite:
                 for file in self._files.glob("*.npz"):
                     file.unlink()
-        lines = [
-            f"# Of `ropetrace {self._command}`. A run with other settings needs another folder.",
-            _toml(_with_version(settings)),
-        ]
-        if measured:
-            lines += [
-                "",
-                "# From a frame's arrival to its centreline, simulated seconds; measured once, then applied to all.",
-                "[compute_time]",
-                *(f"{name} = {value!r}" for name, value in sorted(measured.items())),
-            ]
-        replace_file(self._settings_path, ("\n".join(lines) + "\n").encode())
+        self._settings.write(settings, measured)
 
     def run_path(self, run: SomeRun) -> Path:
         """The file of a run."""

@@ -87,7 +87,7 @@ def run_cases(
     # The longest first: so no core is left with one at the end.
     open_cases.sort(key=lambda case: -case.work)
     jobs = min(jobs or len(os.sched_getaffinity(0)), len(open_cases))
-    with process_pool(jobs) if cluster is None else _dask(cluster) as executor:
+    with process_pool(jobs) if cluster is None else dask_executor(cluster) as executor:
         running: dict[Future[Result], SomeCase] = {}
         with without_interrupt():
             for case in open_cases:
@@ -143,7 +143,16 @@ def process_pool(jobs: int) -> Iterator[Executor]:
 
 
 @contextmanager
-def _dask(address: str) -> Iterator[Executor]:
+def dask_executor(address: str) -> Iterator[Executor]:
+    """The workers of a Dask scheduler.
+
+    Raises
+    ------
+    ConfigError
+        If no scheduler answers.
+    MissingExtraError
+        If Dask is not installed.
+    """
     distributed = import_extra("distributed", "cluster")
     try:
         client = distributed.Client(address, timeout=10, set_as_default=False)

@@ -12,8 +12,8 @@ from ropetrace.recordings.base import DEFAULT_PAIR_GAP, Recording, RecordingInfo
 
 __all__ = ["Recording", "RecordingInfo", "StreamInfo", "open_recording"]
 
-_CLOUD_SUFFIXES = (".npy", ".npz", ".ply", ".pcd")
-_ROS_MAGICS = (b"\x89MCAP", b"SQLite format 3", b"#ROSBAG V")
+CLOUD_SUFFIXES = (".npy", ".npz", ".ply", ".pcd")
+ROS_MAGICS = (b"\x89MCAP", b"SQLite format 3", b"#ROSBAG V")
 _PACKED = (".zstd", ".zst")
 _KNOWN = (
     "a folder with depth.txt and camera.json (RGB-D), a folder with depth_*.png and intrinsics.json, "
@@ -30,12 +30,12 @@ def open_recording(
     cloud_topic: str | None = None,
     max_pair_gap: float = DEFAULT_PAIR_GAP,
 ) -> Recording:
-    """Open a recording of any known kind, recognised by what is in it.
+    """Open a recording of any known kind, recognised by what is in it, or a live camera.
 
     Parameters
     ----------
     path : path
-        A file or a folder.
+        A file or a folder; or ``sim:SCENARIO``, ``realsense:`` or ``realsense:SERIAL`` for a `LiveRecording`.
     rate : float, optional
         Frames per second, for recordings that have no stamps of their own (and only for those).
     depth_topic, color_topic, cloud_topic : str, optional
@@ -48,9 +48,19 @@ def open_recording(
     ------
     RecordingError
         If it cannot be read, or not as it was asked for; the message says what to do.
+    ConfigError
+        If the scenario of a live simulation is unknown or wrong.
     MissingExtraError
-        If it is a .ply or .pcd cloud and the package that reads it is not installed.
+        If the package that reads a .ply or .pcd cloud, or that a live camera needs, is not installed.
     """
+    from ropetrace.live import open_live, scheme_of
+
+    if scheme_of(path) is not None:
+        if rate is not None:
+            raise RecordingError(f"{path}: a live source has stamps of its own: leave out --rate")
+        if depth_topic is not None or color_topic is not None or cloud_topic is not None:
+            raise RecordingError(f"{path}: a live source has no topics: leave the topics out")
+        return open_live(path)
     path = Path(path)
     if rate is not None and not (math.isfinite(rate) and 1e-3 <= rate <= 1e6):
         raise RecordingError(f"the rate {rate} is impossible: give frames per second, such as 30")
@@ -98,7 +108,7 @@ def _holds_ros(path: Path, names: list[str] | None) -> bool:
         raise RecordingError(f"{path}: the file is empty (0 bytes)")
     if path.name.endswith(_PACKED):
         raise RecordingError(f"{path}: a compressed file: unpack it first, with 'zstd -d {path.name}'")
-    return path.suffix.lower() in (".mcap", ".db3", ".bag") or head.startswith(_ROS_MAGICS)
+    return path.suffix.lower() in (".mcap", ".db3", ".bag") or head.startswith(ROS_MAGICS)
 
 
 def _open_folder(path: Path, names: list[str], rate: float | None, max_pair_gap: float) -> Recording:
@@ -111,7 +121,7 @@ def _open_folder(path: Path, names: list[str], rate: float | None, max_pair_gap:
         from ropetrace.recordings.depth_folder import DepthFolder
 
         return DepthFolder(path, _needed_rate(path, rate, DepthFolder.kind))
-    if any(name.lower().endswith(_CLOUD_SUFFIXES) for name in names):
+    if any(name.lower().endswith(CLOUD_SUFFIXES) for name in names):
         from ropetrace.recordings.clouds import CloudFiles
 
         return CloudFiles(path, _needed_rate(path, rate, "folder of clouds"))
@@ -124,7 +134,7 @@ def _open_folder(path: Path, names: list[str], rate: float | None, max_pair_gap:
 
 
 def _open_file(path: Path, rate: float | None) -> Recording:
-    if path.suffix.lower() in _CLOUD_SUFFIXES:
+    if path.suffix.lower() in CLOUD_SUFFIXES:
         from ropetrace.recordings.clouds import CloudFiles
 
         return CloudFiles(path)

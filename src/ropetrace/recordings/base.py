@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ropetrace.errors import FrameError, RecordingError
-from ropetrace.types import Event, Intrinsics
+from ropetrace.types import BadFrame, Event, Intrinsics, lacks_color
 
 DEFAULT_PAIR_GAP = 0.02
 """Colour and depth that were taken farther apart than this are not of one moment, seconds."""
@@ -143,6 +143,14 @@ class Recording(Protocol):
             If nothing at all can be read.
         """
         ...
+
+
+def has_color(recording: Recording, start: int = 0) -> bool:
+    """Whether the first sound frame has colour; true if there is no sound frame, which shows later."""
+    for event in recording.frames(start, 50):
+        if not isinstance(event, BadFrame):
+            return not lacks_color(event)
+    return True
 
 
 class StampStatistics:

@@ -89,7 +89,8 @@ class Pairing(Generic[Depth, Color]):
 
     def _leave(self) -> tuple[int, Depth, Color | str]:
         stamp, depth, _ = self._depths.popleft()
-        best = min(self._colors, key=lambda color: abs(color[0] - stamp), default=None)
+        # Of images that repeat a stamp the last belongs to the depth image that has just come.
+        best = min(reversed(self._colors), key=lambda color: (abs(color[0] - stamp), color[0]), default=None)
         gap = None if best is None else abs(best[0] - stamp)
         if best is None or gap is None or gap > self._max_gap_ns:
             return stamp, depth, missing_color(gap, self._max_gap_ns)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -212,7 +214,32 @@ class WholeFile:
                 raise
             self.size += written
 
+    def lock(self) -> None:
+        """Have every other process that locks the file refused, as long as it is open here."""
+        lock(self._file, self._path)
+
+    def sync(self) -> None:
+        """Wait until the disk has all that was written."""
+        with writing(self._path):
+            os.fdatasync(self._file.fileno())
+
     def close(self) -> None:
         """Close the file; a second call does nothing."""
         with writing(self._path):
             self._file.close()
+
+
+def lock(file: BinaryIO | int, path: Path) -> None:
+    """Lock an open file or folder until it is closed.
+
+    Raises
+    ------
+    OutputError
+        If another process has locked it.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise OutputError(f"{path} is being written by another process") from None
+    except OSError:
+        pass  # some network file systems have no locks

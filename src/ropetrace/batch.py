@@ -1,0 +1,357 @@
+"""Tracks the rope through many recordings side by side, and keeps each result as soon as it is finished.
+
+On this machine the processes of `ropetrace.evaluation.workers` serve: one that dies or hangs fails its recording alone.
+On a cluster Dask does, by the interface of `concurrent.futures`; its workers read and write the same paths as this
+process.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import shutil
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import ExitStack
+from dataclasses import astuple, dataclass, fields
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from ropetrace.config import RopeConfig
+from ropetrace.errors import ConfigError, RecordingError, RopetraceError
+from ropetrace.evaluation.run_folder import SettingsFile, replace_file
+from ropetrace.evaluation.runner import dask_executor
+from ropetrace.evaluation.workers import Worker, WorkerLostError, Workers
+from ropetrace.motion import make_motion
+from ropetrace.recordings import open_recording
+from ropetrace.recordings.base import has_color
+from ropetrace.results import open_writer
+from ropetrace.results.base import lock, writing
+from ropetrace.trackers import make_tracker
+from ropetrace.tracking import track_recording
+from ropetrace.types import Estimate, Status
+
+FORMATS = ("csv", "parquet", "npz", "mcap")
+"""The endings of results."""
+
+SUMMARY = "summary.csv"
+
+_PART = ".part-"
+"""What the folders begin with in which workers write, until a result is whole."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a recording: a row of the summary.
+
+    Parameters
+    ----------
+    recording : str
+        Its path below the folder that all are in.
+    frames : int
+        That were tracked.
+    ok, degraded, lost : int
+        Estimates of each status; one a frame where there is one rope.
+    seconds : float
+        That it took.
+    result : str
+        The file of results, below the folder of results; empty if the recording failed.
+    error : str
+        Why it failed; or, beside a result, what damage was found. Empty if all is well.
+    """
+
+    recording: str
+    frames: int = 0
+    ok: int = 0
+    degraded: int = 0
+    lost: int = 0
+    seconds: float = 0.0
+    result: str = ""
+    error: str = ""
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no result."""
+        return not self.result
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A recording to be tracked, and all that a worker must know for that.
+
+    Parameters
+    ----------
+    recording : Path
+        Where it is.
+    name : str
+        Its path below the folder that all recordings are in.
+    out : Path
+        The folder of results; the result is ``<name>.<format>`` below it.
+    format : str
+        One of `FORMATS`.
+    config : RopeConfig
+        Of the rope.
+    options : mapping
+        Of `open_recording`.
+    start : int
+        Frames to skip.
+    limit : int, optional
+        Frames to use at most.
+    """
+
+    recording: Path
+    name: str
+    out: Path
+    format: str
+    config: RopeConfig
+    options: dict[str, Any]
+    start: int = 0
+    limit: int | None = None
+
+    @property
+    def result(self) -> str:
+        """The file of results, below the folder of results."""
+        return f"{self.name}.{self.format}"
+
+
+class ResultFolder:
+    """The folder of a batch: the results, `settings.toml`, and `summary.csv` with a row for each recording.
+
+    The summary grows by a row whenever a recording is finished or has failed, so that a run that is killed can go on.
+    A context manager, which nobody else can be in meanwhile.
+
+    Parameters
+    ----------
+    path : Path
+        The folder.
+    settings : mapping
+        What all results depend on; see `SettingsFile`.
+    overwrite : bool
+        Begin anew: results that were listed before are removed.
+
+    Attributes
+    ----------
+    outcomes : dict of str to Outcome
+        By the recording.
+
+    Raises
+    ------
+    ConfigError
+        If results with other settings are there.
+    OutputError
+        If the folder holds something else, cannot be written, or another batch writes to it.
+    """
+
+    def __init__(self, path: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
+        self.path = path
+        self.outcomes: dict[str, Outcome] = {}
+        self._summary = path / SUMMARY
+        file = SettingsFile(path, "batch")
+        if not overwrite:
+            file.measured(settings)
+        with ExitStack() as stack, writing(path):
+            path.mkdir(parents=True, exist_ok=True)
+            # Of the folder itself: the settings are replaced as a whole.
+            handle = os.open(path, os.O_RDONLY)
+            stack.callback(os.close, handle)
+            lock(handle, path)
+            self._remove_parts()
+            before = self._read()
+            if overwrite:
+                for outcome in before:
+                    (path / outcome.result).unlink(missing_ok=True) if outcome.result else None
+            else:
+                self.outcomes = {outcome.recording: outcome for outcome in before if self._is_kept(outcome)}
+            file.write(settings)
+            self._rewrite(self.outcomes.values())
+            self._rows = stack.enter_context(self._summary.open("ab", buffering=0))
+            self._stack = stack.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._remove_parts()
+        self._stack.close()
+
+    def _remove_parts(self) -> None:
+        """What killed workers left behind."""
+        for part in self.path.glob(_PART + "*"):
+            shutil.rmtree(part, ignore_errors=True)
+
+    def finished(self, name: str) -> bool:
+        """Whether a recording has a result."""
+        return name in self.outcomes and not self.outcomes[name].failed
+
+    def add(self, outcome: Outcome) -> None:
+        """Keep the outcome of a recording, whose result is in its place."""
+        self.outcomes[outcome.recording] = outcome
+        with writing(self._summary):
+            self._rows.write(_rows([astuple(outcome)]))
+
+    def sort(self, names: Sequence[str]) -> None:
+        """Put the summary in the order of these recordings; others stay behind them."""
+        ordered = {name: self.outcomes[name] for name in names if name in self.outcomes}
+        self._rewrite((ordered | self.outcomes).values())
+
+    def _is_kept(self, outcome: Outcome) -> bool:
+        return bool(outcome.result) and (self.path / outcome.result).is_file()
+
+    def _read(self) -> list[Outcome]:
+        """The outcomes of the summary; a row that was cut off by a kill is none."""
+        if not self._summary.exists():
+            return []
+        found = []
+        text = self._summary.read_text(encoding="utf-8", errors="surrogateescape")
+        for row in list(csv.reader(io.StringIO(text, newline="")))[1:]:
+            try:
+                recording, frames, ok, degraded, lost, seconds, result, error = row
+                counts = (int(frames), int(ok), int(degraded), int(lost))
+                outcome = Outcome(recording, *counts, float(seconds), result, error)
+            except ValueError:
+                continue
+            if not Path(result).is_absolute() and ".." not in Path(result).parts:
+                found.append(outcome)
+        return found
+
+    def _rewrite(self, outcomes: Iterable[Outcome]) -> None:
+        header = tuple(item.name for item in fields(Outcome))
+        replace_file(self._summary, _rows([header, *map(astuple, outcomes)]))
+
+
+def _rows(rows: Sequence[tuple[Any, ...]]) -> bytes:
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows(rows)
+    return stream.getvalue().encode("utf-8", "surrogateescape")
+
+
+def run_batch(
+    folder: ResultFolder,
+    tasks: Sequence[Task],
+    *,
+    jobs: int = 1,
+    cluster: str | None = None,
+    on_outcome: Callable[[Outcome], object] = lambda outcome: None,
+) -> None:
+    """Track the recordings that have no result yet. One that fails is told and does not stop the rest.
+
+    Parameters
+    ----------
+    folder : ResultFolder
+        Takes the outcomes. An interruption keeps those that are finished.
+    tasks : sequence of Task
+        Recordings of different names.
+    jobs : int
+        At a time on this machine.
+    cluster : str, optional
+        Address of a Dask scheduler, in place of this machine; see `ropetrace.evaluation.runner.check_engine`.
+    on_outcome : callable
+        Is told of each.
+
+    Raises
+    ------
+    ConfigError
+        If the cluster cannot be reached, or has another version of ropetrace.
+    """
+    waiting = [task for task in tasks if not folder.finished(task.name)]
+    if not waiting:
+        return
+    for outcome in _run_here(waiting, min(jobs, len(waiting))) if cluster is None else _run_there(waiting, cluster):
+        folder.add(outcome)
+        on_outcome(outcome)
+
+
+def _run_here(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
+    waiting = deque(tasks)
+    with Workers(jobs) as workers:
+        running: dict[Worker, Task] = {}
+        while waiting or running:
+            while waiting and (worker := workers.idle()):
+                task = running[worker] = waiting.popleft()
+                worker.begin(track_task, task)
+            for worker in workers.wait(running):
+                task = running.pop(worker)
+                try:
+                    yield worker.result()
+                except (RopetraceError, WorkerLostError) as error:
+                    yield Outcome(task.name, error=str(error))
+
+
+def _run_there(tasks: Sequence[Task], cluster: str) -> Iterator[Outcome]:
+    with dask_executor(cluster) as executor:
+        wanted = version("ropetrace")
+        running: dict[Future[Outcome], Task] = {executor.submit(_on_cluster, task, wanted): task for task in tasks}
+        while running:
+            for future in wait(running, timeout=1, return_when=FIRST_COMPLETED)[0]:
+                task = running.pop(future)
+                try:
+                    yield future.result()
+                except ConfigError:
+                    raise
+                except Exception as error:  # such as Dask's KilledWorker
+                    yield Outcome(task.name, error=f"{type(error).__name__}: {error}")
+
+
+def _on_cluster(task: Task, wanted: str) -> Outcome:
+    if version("ropetrace") != wanted:
+        raise ConfigError(f"a worker has ropetrace {version('ropetrace')}, not {wanted}")
+    return track_task(task)
+
+
+def track_task(task: Task, on_frame: Callable[[], object] = lambda: None) -> Outcome:
+    """Track one recording; its result is in its place wholly or not at all.
+
+    Parameters
+    ----------
+    task : Task
+        Which.
+    on_frame : callable
+        Is told of every frame.
+    """
+    started = time.monotonic()
+    try:
+        with writing(task.out), tempfile.TemporaryDirectory(prefix=_PART, dir=task.out) as part:
+            return _tracked(task, Path(part) / f"result.{task.format}", on_frame, started)
+    except RopetraceError as error:
+        return Outcome(task.name, seconds=_seconds_since(started), error=str(error))
+
+
+def _tracked(task: Task, part: Path, on_frame: Callable[[], object], started: float) -> Outcome:
+    def tell(estimate: Estimate) -> None:
+        on_frame()
+
+    config = task.config
+    recording = open_recording(task.recording, **task.options)
+    if config.asks_for_color and not has_color(recording, task.start):
+        raise ConfigError("a colour is asked for, but the recording has none")
+    with open_writer(part, metadata={"config": config.resolved().to_toml()}) as writer:
+        summary = track_recording(
+            recording.frames(task.start, task.limit),
+            make_tracker(config),
+            [writer],
+            motion=partial(make_motion, config.motion.method, config.diameter),
+            first_index=task.start,
+            on_frame=tell,
+        )
+    if not summary.frames:
+        raise RecordingError(f"{task.recording}: there is no frame at or after --start {task.start}")
+    place = task.out / task.result
+    place.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(part, place)
+    ok, degraded, lost = (sum(rope.statuses[status] for rope in summary.ropes.values()) for status in Status)
+    damage = "; ".join(recording.problems)
+    seconds = _seconds_since(started)
+    return Outcome(task.name, summary.frames, ok, degraded, lost, seconds, task.result, damage)
+
+
+def _seconds_since(started: float) -> float:
+    return round(time.monotonic() - started, 3)

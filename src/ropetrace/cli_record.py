@@ -1,0 +1,206 @@
+"""The commands that record, and that finish a recording which was killed: words for people, no logic."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Generator
+from contextlib import closing
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from tyro.conf import OmitArgPrefixes, arg
+
+from ropetrace.cli_source import Source, TrackedRope
+from ropetrace.errors import ConfigError, OutputError
+from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND, progress_bar
+
+if TYPE_CHECKING:
+    from ropetrace.config import RopeConfig
+    from ropetrace.recorder import BackgroundRecorder
+    from ropetrace.recordings import Recording
+    from ropetrace.trackers import Tracker
+    from ropetrace.tracking import Summary
+    from ropetrace.types import Event
+
+
+@dataclass(frozen=True)
+class Record:
+    """Record frames in an .mcap file of which a kill takes nothing. With a rope, track it too.
+
+    ropetrace record SOURCE --out recording.mcap
+
+    ropetrace record SOURCE --out recording.mcap --diameter 12mm --color '#c8281e'
+    """
+
+    source: OmitArgPrefixes[Source]
+    rope: OmitArgPrefixes[TrackedRope]
+    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
+    """The recording: .mcap."""
+    overwrite: bool = False
+    """Replace a file that exists."""
+
+    def run(self) -> int:
+        from ropetrace.recorder import BackgroundRecorder, Recorder
+        from ropetrace.results import check_outputs
+        from ropetrace.trackers import make_tracker
+
+        if self.out.suffix.lower() != ".mcap":
+            raise OutputError(f"{self.out}: a recording is an .mcap file")
+        inputs = [self.source.recording, *([] if self.rope.config is None else [self.rope.config])]
+        check_outputs([self.out], self.overwrite, inputs)
+        config = self._config()
+        recording = self.source.open()
+        if config is not None:
+            _check_color(recording, config, self.source.part.start)
+        tracker = None if config is None else make_tracker(config)
+        metadata = {} if config is None else {"config": config.resolved().to_toml()}
+        recorder = Recorder(self.out, overwrite=self.overwrite, metadata=metadata)
+        try:
+            with BackgroundRecorder(recorder) as background:
+                run = _Run(self.source, recording, background)
+                summary = run.frames() if config is None or tracker is None else run.tracked(config, tracker)
+        finally:
+            if not recorder.frames:
+                self.out.unlink(missing_ok=True)
+        return run.tell(summary, config is not None)
+
+    def _config(self) -> RopeConfig | None:
+        if all(getattr(self.rope, item.name) is None for item in fields(self.rope)):
+            return None
+        return self.rope.settings(self.source.first_frames)
+
+
+@dataclass(frozen=True)
+class Recover:
+    """Finish a recording whose recorder was killed, so that other tools can read it too: in place, in one pass."""
+
+    recording: Annotated[Path, tyro.conf.Positional, arg(metavar="FILE")]
+    """An .mcap file of `ropetrace record`, or of `ropetrace track`."""
+
+    def run(self) -> int:
+        from ropetrace.recordings.mcap_recover import recover
+
+        size = self.recording.stat().st_size if self.recording.is_file() else None
+        with progress_bar(size, "B") as bar:
+            found = recover(self.recording, bar.update)
+        if found.was_whole:
+            print(f"{self.recording} is whole: {found.messages} messages; nothing was changed")
+        else:
+            print(
+                f"{self.recording}: {found.messages} messages; finished, after {found.cut} bytes were cut off its end"
+            )
+        return 0
+
+
+class _Run:
+    """The frames on their way to the recorder, and what became of them."""
+
+    def __init__(self, source: Source, recording: Recording, recorder: BackgroundRecorder) -> None:
+        from ropetrace.live import LiveRecording
+
+        self._source = source
+        self._recording = recording
+        self._recorder = recorder
+        self._live = recording if isinstance(recording, LiveRecording) else None
+        self._unreadable = 0
+
+    def frames(self) -> Summary:
+        """Record without tracking."""
+        from ropetrace.tracking import Summary
+
+        summary = Summary()
+        with self._bar() as bar, closing(self._recorded()) as events:
+            try:
+                for _ in events:
+                    bar.update()
+                    if self._should_stop():
+                        break
+            except KeyboardInterrupt:
+                summary.interrupted = True
+        summary.interrupted |= bool(INTERRUPTS)
+        return summary
+
+    def tracked(self, config: RopeConfig, tracker: Tracker) -> Summary:
+        """Record and track; each frame is on its way to the disk before it is tracked."""
+        from ropetrace.motion import make_motion
+        from ropetrace.tracking import track_recording
+
+        with self._bar() as bar, closing(self._recorded()) as events:
+            return track_recording(
+                events,
+                tracker,
+                [self._recorder],
+                motion=partial(make_motion, config.motion.method, config.diameter),
+                first_index=self._source.part.start,
+                on_frame=lambda estimate: bar.update(),
+                should_stop=self._should_stop,
+            )
+
+    def tell(self, summary: Summary, tracked: bool) -> int:
+        """Say what came of it; the exit code."""
+        recorder, recording = self._recorder, self._recording
+        written = recorder.recorder
+        print(f"recorded  {written.frames} frames, {written.size / 1e6:.1f} MB")
+        if recorder.dropped or recorder.dropped_estimates:
+            print(
+                f"dropped   {recorder.dropped} frames and {recorder.dropped_estimates} estimates that the disk was too "
+                "slow or too full for"
+            )
+        for reason, count in recorder.refused.items():
+            print(f"refused   {count} x {reason}")
+        if self._unreadable:
+            print(f"left out  {self._unreadable} frames that the source could not give")
+        if tracked:
+            print("\n".join(summary.lines()))
+        if self._live is not None:
+            print("\n".join(self._live.lines()))
+        for problem in recording.problems:
+            print(f"damage    {problem}")
+        if recorder.failure is not None:
+            print(f"ropetrace: {recorder.failure}; what was recorded before is kept", file=sys.stderr)
+            return BAD_INPUT
+        if written.frames:
+            print(f"written   {written.path}")
+        # A live source has no other end.
+        if summary.interrupted and self._live is None:
+            print("ropetrace: interrupted; what was recorded until then is kept", file=sys.stderr)
+            return INTERRUPTED
+        if not written.frames:
+            print("ropetrace: no frame was recorded", file=sys.stderr)
+            return NOTHING_FOUND
+        if recording.problems or recorder.dropped or recorder.refused or self._unreadable:
+            print("ropetrace: part of the frames is not in the recording (see above)", file=sys.stderr)
+            return DAMAGED
+        return 0
+
+    def _recorded(self) -> Generator[Event]:
+        """The frames, each handed to the recorder first. A file waits for the disk, a camera does not."""
+        from ropetrace.types import BadFrame
+
+        part = self._source.part
+        for event in self._recording.frames(part.start, part.limit):
+            if isinstance(event, BadFrame):
+                self._unreadable += 1
+            elif self._live is None:
+                self._recorder.put(event)
+            else:
+                self._recorder.offer(event)
+            yield event
+
+    def _should_stop(self) -> bool:
+        return bool(INTERRUPTS) or self._recorder.failure is not None
+
+    def _bar(self) -> Any:
+        count, part = self._recording.frame_count, self._source.part
+        left = None if count is None else max(count - part.start, 0)
+        return progress_bar(part.limit if left is None or (part.limit or left) < left else left, "frame")
+
+
+def _check_color(recording: Recording, config: RopeConfig, start: int) -> None:
+    from ropetrace.recordings.base import has_color
+
+    if config.asks_for_color and not has_color(recording, start):
+        raise ConfigError("a colour is asked for, but the source has none: leave out the colour, or record it")

@@ -1,0 +1,258 @@
+"""The paper's node kinematic_system: the rope's motion and the arm's joints in, joint velocities out."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ropetrace.control.arm import Arm
+from ropetrace.control.controller import TracingController
+from ropetrace.control.limits import Command, GuardOptions, ToolLimits
+from ropetrace.control.tracing import Phase, TracingSettings
+from ropetrace.errors import ConfigError, FrameError
+from ropetrace.recordings.ros_messages import stamp_and_frame
+from ropetrace.results.ros_estimates import PATH, TRAJECTORY, header, topic_of
+from ropetrace.ros2 import messages
+from ropetrace.ros2.messages import JOINTS, NUMBERS
+from ropetrace.ros2.reporting import Reporter
+from ropetrace.ros2.topics import RosNode, check_topic
+from ropetrace.types import Estimate, FloatArray, Motion, Status, Waypoints
+
+MARGIN = 0.01
+"""The guard keeps this far from the ends of the joints' ranges, rad."""
+
+JOINTS_FRESH = 0.1
+"""The arm brakes while its joints' newest positions are older than this, seconds."""
+
+ARM_GONE = 1.0
+"""An arm that has said nothing for this long is gone, seconds; when it is back, all begins from where it stands."""
+
+LONGEST_BRAKING = 2.0
+"""For which a node that is told to stop goes on until the arm is at rest, seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArmSettings:
+    """Which arm, and where it is spoken to.
+
+    Raises
+    ------
+    ConfigError
+        If a value is impossible.
+    """
+
+    arm: str = "panda"
+    """One that comes with ropetrace: panda or fr3."""
+    rate: float = 100.0
+    """Commands in a second."""
+    joint_topic: str = "/joint_states"
+    """sensor_msgs/JointState of the arm."""
+    command_topic: str = "/ropetrace/velocity_commands"
+    """std_msgs/Float64MultiArray of joint velocities, such as /forward_velocity_controller/commands."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rate) and 1 <= self.rate <= 1000):
+            raise ConfigError(f"rate = {self.rate} Hz: expected 1 to 1000")
+        for name in (self.joint_topic, self.command_topic):
+            check_topic(name)
+
+
+class ReceivedMotion:
+    """A `motion.MotionEstimator` that is told the motion: predictions go on from it at constant acceleration."""
+
+    def __init__(self) -> None:
+        self._known: tuple[int, Waypoints, Motion] | None = None
+        self._next: Motion | None = None
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """Of the newest frame whose motion is known, nanoseconds."""
+        return None if self._known is None else self._known[0]
+
+    def announce(self, motion: Motion) -> None:
+        """The motion of the waypoints that `update` is given next."""
+        self._next = motion
+
+    def update(self, stamp_ns: int, waypoints: Waypoints) -> Motion | None:
+        """Take the waypoints whose motion was announced; a stamp that is not newer adds nothing."""
+        if self._next is not None and (self._known is None or stamp_ns > self._known[0]):
+            self._known = stamp_ns, waypoints, self._next
+        return self._next
+
+    def predict(self, ahead: float) -> tuple[FloatArray, Motion] | None:
+        """See `motion.MotionEstimator.predict`."""
+        if self._known is None:
+            return None
+        _, waypoints, motion = self._known
+        velocities = motion.velocities + ahead * motion.accelerations
+        unknown = np.full(velocities.shape, np.nan)
+        return (
+            waypoints.positions + ahead * motion.velocities + 0.5 * ahead**2 * motion.accelerations,
+            Motion(velocities, motion.accelerations, unknown, unknown, unknown),
+        )
+
+    def reset(self) -> None:
+        """Forget all."""
+        self._known = self._next = None
+
+
+class KinematicSystem:
+    """Lets an arm trace the first rope; it reads ``centerline``, to know when the rope is lost, and ``motion``.
+
+    The commands are two messages: the velocities alone, as ros2_control takes them, and ``joint_commands``, a
+    JointState with names and a stamp. Nothing is sent before the arm's joints are known. Where the rope, its motion or
+    the joints' positions are missing or too old, the arm brakes, as `control.controller` has it. After an arm that was
+    gone for `ARM_GONE` has come back, the tracing begins anew.
+
+    Parameters
+    ----------
+    node : RosNode
+        Of the graph.
+    base_from_camera : (4, 4) float array
+        The camera's pose in the frame of the arm's base.
+    settings : ArmSettings
+        Of the arm.
+    tracing : TracingSettings, optional
+        Of the tracer; by default with a lead of half a period.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such arm.
+    MissingExtraError
+        If Pinocchio is not installed.
+    """
+
+    def __init__(
+        self,
+        node: RosNode,
+        base_from_camera: FloatArray,
+        settings: ArmSettings | None = None,
+        tracing: TracingSettings | None = None,
+    ) -> None:
+        self.settings = settings or ArmSettings()
+        self.period = 1 / self.settings.rate
+        self._arm = Arm.named(self.settings.arm)
+        self._base_from_camera = base_from_camera
+        self._tracing = tracing or TracingSettings(lead=self.period / 2)
+        self._motion = ReceivedMotion()
+        self._paths = node.subscription(topic_of(0, "centerline"), PATH, depth=10)
+        self._moving = node.subscription(topic_of(0, "motion"), TRAJECTORY)
+        self._joints = node.subscription(self.settings.joint_topic, JOINTS)
+        self._velocities = node.publisher(self.settings.command_topic, NUMBERS)
+        self._commands = node.publisher(topic_of(0, "joint_commands"), JOINTS)
+        self._reporter = Reporter(node)
+        self._controller: TracingController | None = None
+        self._position: FloatArray | None = None
+        self._position_time = -math.inf
+        self._fault = ""
+
+    def run(self, should_stop: Callable[[], bool]) -> None:
+        """Control at the fixed rate until told to stop; then bring the arm to rest."""
+        due = time.monotonic()
+        stop_at = math.inf
+        while time.monotonic() < stop_at and not (should_stop() and self.at_rest):
+            if should_stop() and stop_at == math.inf:
+                stop_at = time.monotonic() + LONGEST_BRAKING
+            self.step(time.time(), "told to stop" if should_stop() else None)
+            due = max(due + self.period, time.monotonic() - self.period)
+            time.sleep(max(due - time.monotonic(), 0.0))
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the arm is told to stand still."""
+        return self._controller is None or self._controller.guard.at_rest
+
+    def step(self, now: float, stop: str | None = None) -> Command | None:
+        """One control step.
+
+        Parameters
+        ----------
+        now : float
+            Seconds since 1970.
+        stop : str, optional
+            A reason to bring the arm to rest.
+
+        Returns
+        -------
+        Command or None
+            What was sent; None where nothing was, since there is no arm.
+        """
+        self._learn_joints(now)
+        age = now - self._position_time
+        if self._controller is not None and age > ARM_GONE and self._controller.guard.at_rest:
+            self._controller = None
+        if self._controller is None and age <= JOINTS_FRESH and self._position is not None:
+            self._motion.reset()
+            self._controller = TracingController(
+                self._arm,
+                self._position,
+                self._base_from_camera,
+                self._motion,
+                self.period,
+                self._tracing,
+                GuardOptions(margin=MARGIN),
+                ToolLimits(period=self.period),
+            )
+            # Making it may have taken longer than the guard lets pass between two steps.
+            return None
+        self._see(self._controller)
+        if self._controller is None:
+            told = self._fault or self._joints.problem() or f"no arm: nothing came on {self._joints.topic}"
+            self._reporter.tell(Status.LOST, told)
+            return None
+        fresh = self._position if age <= JOINTS_FRESH else None
+        if stop is None:
+            step, command = self._controller.act(now, fresh)
+            phase = "" if step is None else str(step.phase)
+        else:
+            command, phase = self._controller.guard.step(now, self._believed(fresh), None, now, stop), ""
+        self._send(now, command)
+        if fresh is None:
+            self._reporter.tell(Status.LOST, self._fault or f"{self._joints.topic} is silent for {age:.2f} s: braking")
+        elif command.reason is None or phase == Phase.DONE:
+            self._reporter.tell(Status.OK, phase)
+        else:
+            self._reporter.tell(Status.DEGRADED, f"braking: {command.text}", {"reason": str(command.reason)})
+        return command
+
+    def _believed(self, fresh: FloatArray | None) -> FloatArray:
+        return np.full(self._arm.count, np.nan) if fresh is None else fresh
+
+    def _learn_joints(self, now: float) -> None:
+        message = self._joints.newest()
+        if message is None:
+            return
+        try:
+            self._position = messages.joint_values(message, self._arm.joint_names, "position")
+        except FrameError as error:
+            self._fault = str(error)
+        else:
+            self._position_time, self._fault = now, ""
+
+    def _see(self, controller: TracingController | None) -> None:
+        """Hand on what came of the rope; without a controller it is forgotten."""
+        paths, moving = self._paths.take(), self._moving.newest()
+        if controller is None:
+            return
+        try:
+            for message in paths:
+                if not len(messages.waypoints(message)):
+                    controller.see(Estimate.lost(stamp_and_frame(message)[0], "the path is empty"))
+            if moving is None:
+                return
+            known = messages.moving_waypoints(moving)
+            if known is not None:
+                self._motion.announce(known[1])
+                controller.see(Estimate(stamp_and_frame(moving)[0], Status.OK, waypoints=known[0]))
+        except FrameError as error:
+            self._reporter.tell(Status.DEGRADED, str(error))
+
+    def _send(self, now: float, command: Command) -> None:
+        self._velocities.put(messages.numbers(command.velocity))
+        held = header(round(now * 1e9), "")
+        self._commands.put(messages.joint_state(held, self._arm.joint_names, None, command.velocity))

@@ -1,0 +1,42 @@
+"""What a node is at, for people and for ``/diagnostics``."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+
+from ropetrace.results.ros_estimates import DIAGNOSTICS, diagnostics, header
+from ropetrace.ros2.topics import RosNode
+from ropetrace.types import Status
+
+EVERY = 1.0
+"""Between two messages that say the same, seconds."""
+
+
+class Reporter:
+    """Tells how a node is: on ``/diagnostics`` each second and at every change, and changes on stderr.
+
+    Parameters
+    ----------
+    node : RosNode
+        Of whom.
+    """
+
+    def __init__(self, node: RosNode) -> None:
+        self._name = node.name
+        self._publisher = node.publisher("/diagnostics", DIAGNOSTICS)
+        self._kind = ""
+        self._told = -EVERY
+
+    def tell(self, status: Status, text: str, values: dict[str, str] | None = None) -> None:
+        """Say it, if it is new or a second has passed; figures alone make nothing new."""
+        now, kind = time.monotonic(), f"{status} {re.sub(r'[-+]?[0-9][0-9.e+-]*', '#', text)}"
+        changed = kind != self._kind
+        if not changed and now - self._told < EVERY:
+            return
+        if changed:
+            print(f"{self._name}: {status}: {text}", file=sys.stderr, flush=True)
+        self._kind, self._told = kind, now
+        held = header(time.time_ns(), "")
+        self._publisher.put(diagnostics(held, f"ropetrace: {self._name}", status, text, values or {}))

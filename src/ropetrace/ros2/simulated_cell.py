@@ -1,0 +1,139 @@
+"""A camera and an arm that are simulated, in real time: case study 2's, for tests and for trying the nodes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ropetrace.config import RopeConfig
+from ropetrace.control.arm import Arm
+from ropetrace.errors import FrameError
+from ropetrace.evaluation.case1 import CONDITIONS, Case1Settings, rope_config, scenario
+from ropetrace.evaluation.case2 import CONTROL_RATE, PLACEMENTS
+from ropetrace.recordings.ros_frames import frame_messages
+from ropetrace.results.ros_estimates import header, topic_of
+from ropetrace.ros2 import messages
+from ropetrace.ros2.messages import JOINTS
+from ropetrace.ros2.reporting import Reporter
+from ropetrace.ros2.topics import Publisher, RosNode
+from ropetrace.sim.arm import ArmSimulation
+from ropetrace.sim.scenario import CameraSettings, SimulatedScene
+from ropetrace.sim.scene import inverse_pose
+from ropetrace.types import FloatArray, RgbdFrame, Status
+
+COMMAND_LASTS = 0.1
+"""The arm stops by itself when no command has come for this long, seconds."""
+
+JOINT_STATES_EVERY = 2
+"""Control periods between two messages of the joints."""
+
+MOST_BEHIND = 0.5
+"""A simulation that is slower than real time by more is told, and its clock set, seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class CellSettings:
+    """What is simulated."""
+
+    wind: float = 0.0
+    """How often the wind turns in a second; 0 is no wind."""
+    arm: str = "panda"
+    """One whose start `evaluation.case2.PLACEMENTS` knows: panda or fr3."""
+    warm_up: float = 2.0
+    """Seconds of simulated time before the first frame."""
+
+
+def cell_config() -> RopeConfig:
+    """The settings for the nodes: the rope, and the camera's pose in the frame of the arm's base."""
+    world_from_camera = CameraSettings().camera(0).world_from_camera
+    assert world_from_camera is not None
+    pose = inverse_pose(PLACEMENTS["behind"].world_from_base()) @ world_from_camera
+    x, y, z = pose[:3, 3].tolist()
+    qx, qy, qz, qw = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+    return replace(rope_config(Case1Settings(method="persistent")), camera_pose=(x, y, z, qx, qy, qz, qw))
+
+
+class SimulatedCell:
+    """Publishes depth, colour, camera_info and joint_states, and follows ``joint_commands``.
+
+    Parameters
+    ----------
+    node : RosNode
+        Of the graph.
+    settings : CellSettings
+        What is simulated: 480x360 at 30 frames a second, without noise.
+
+    Raises
+    ------
+    ConfigError
+        If a setting is impossible.
+    MissingExtraError
+        If MuJoCo or Pinocchio is not installed.
+    """
+
+    def __init__(self, node: RosNode, settings: CellSettings | None = None) -> None:
+        settings = settings or CellSettings()
+        shared = Case1Settings(warm_up=settings.warm_up)
+        self._simulated = SimulatedScene(scenario(CONDITIONS[0], settings.wind, shared))
+        arm, placement = Arm.named(settings.arm), PLACEMENTS["behind"]
+        self.moving = ArmSimulation(arm, np.array(placement.start), placement.world_from_base())
+        self._arm = arm
+        self._node = node
+        self._images: dict[str, Publisher] = {}
+        self._joints = node.publisher("/joint_states", JOINTS)
+        self._commands = node.subscription(topic_of(0, "joint_commands"), JOINTS)
+        self._reporter = Reporter(node)
+        self._warm_up = settings.warm_up
+        self._velocity = np.zeros(arm.count)
+        self._commanded = -COMMAND_LASTS
+
+    def run(self, should_stop: Callable[[], bool]) -> None:
+        """Simulate in real time until told to stop."""
+        camera, rope = self._simulated.camera, self._simulated.rope
+        rope.advance(self._warm_up)
+        frame = int(np.ceil(self._warm_up * camera.rate)) + 1
+        tick = 0
+        started = time.time()
+        self._reporter.tell(Status.OK, "simulating")
+        while not should_stop():
+            tick += 1
+            now = tick / CONTROL_RATE
+            self.moving.advance(now, self._command())
+            if camera.stamp(frame) <= self._warm_up + now:
+                self._simulated.robot = self.moving.capsules()
+                exposed = camera.expose(self._simulated.scene_at, camera.stamp(frame), frame)
+                stamp_ns = round((started + camera.stamp(frame) - self._warm_up) * 1e9)
+                self._publish(replace(exposed, stamp_ns=stamp_ns))
+                frame += 1
+            rope.advance(self._warm_up + now)
+            if tick % JOINT_STATES_EVERY == 0:
+                held = header(round((started + now) * 1e9), "")
+                state = messages.joint_state(held, self._arm.joint_names, self.moving.position, self.moving.velocity)
+                self._joints.put(state)
+            ahead = started + now - time.time()
+            if ahead < -MOST_BEHIND:
+                started -= ahead
+                self._reporter.tell(Status.DEGRADED, f"slower than real time: {-ahead:.1f} s were left out")
+            time.sleep(max(ahead, 0.0))
+
+    def _command(self) -> FloatArray:
+        message = self._commands.newest()
+        if message is not None:
+            try:
+                self._velocity = messages.joint_values(message, self._arm.joint_names, "velocity")
+                self._commanded = time.monotonic()
+            except FrameError as error:
+                self._reporter.tell(Status.DEGRADED, str(error))
+        if time.monotonic() - self._commanded > COMMAND_LASTS:
+            self._velocity = np.zeros(self._arm.count)
+        return self._velocity
+
+    def _publish(self, frame: RgbdFrame) -> None:
+        for message in frame_messages(frame):
+            if message.topic not in self._images:
+                self._images[message.topic] = self._node.publisher(message.topic, message.type)
+            self._images[message.topic].put_packed(bytes(message.data))

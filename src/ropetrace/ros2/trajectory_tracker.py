@@ -1,0 +1,92 @@
+"""The paper's node trajectory_tracker: centrelines in, how they move and where they are now out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from ropetrace.centerline import waypoints_through
+from ropetrace.config import RopeConfig
+from ropetrace.errors import ConfigError, FrameError
+from ropetrace.motion import make_motion
+from ropetrace.recordings.ros_messages import RawMessage, stamp_and_frame
+from ropetrace.results.ros_estimates import PATH, TRAJECTORY, header, path, topic_of, trajectory
+from ropetrace.ros2 import messages
+from ropetrace.ros2.reporting import Reporter
+from ropetrace.ros2.topics import RosNode
+from ropetrace.ros2.track_deformable import SILENCE, from_the_future
+from ropetrace.types import Status
+
+LONGEST_PREDICTION = 0.5
+"""A centreline older than this is not predicted to the present, seconds."""
+
+
+class TrajectoryTracker:
+    """Follows the first rope's ``centerline``, and publishes its ``motion`` and its ``predicted`` path of this moment.
+
+    Parameters
+    ----------
+    node : RosNode
+        Of the graph.
+    config : RopeConfig
+        Of the rope.
+
+    Raises
+    ------
+    ConfigError
+        If the config wants no motion.
+    """
+
+    def __init__(self, node: RosNode, config: RopeConfig) -> None:
+        motion = make_motion(config.motion.method, config.diameter)
+        if motion is None:
+            raise ConfigError('trajectory_tracker needs the motion: take motion.method = "none" out of the config')
+        self._motion = motion
+        self._node = node
+        self._paths = node.subscription(topic_of(0, "centerline"), PATH, depth=10)
+        self._moving = node.publisher(topic_of(0, "motion"), TRAJECTORY)
+        self._predicted = node.publisher(topic_of(0, "predicted"), PATH)
+        self._reporter = Reporter(node)
+        self._last = time.monotonic()
+
+    def run(self, should_stop: Callable[[], bool]) -> None:
+        """Follow until told to stop."""
+        while not should_stop():
+            self._node.wait(0.1)
+            self.step()
+
+    def step(self) -> None:
+        """Follow every path that has come."""
+        paths = self._paths.take()
+        for message in paths:
+            self._last = time.monotonic()
+            try:
+                self._reporter.tell(*self._follow(message))
+            except FrameError as error:
+                self._reporter.tell(Status.LOST, str(error))
+        silent = time.monotonic() - self._last
+        if not paths and silent > SILENCE:
+            self._reporter.tell(
+                Status.LOST, self._paths.problem() or f"nothing came on {self._paths.topic} for {silent:.1f} s"
+            )
+
+    def _follow(self, message: RawMessage) -> tuple[Status, str]:
+        """Take one path; how it went."""
+        stamp_ns, frame_id = stamp_and_frame(message)
+        waypoints = messages.waypoints(message)
+        if not len(waypoints):
+            return Status.LOST, "the rope is lost"
+        motion = self._motion.update(stamp_ns, waypoints)
+        if motion is None:
+            return Status.DEGRADED, "the motion is not known yet"
+        self._moving.put(trajectory(header(stamp_ns, frame_id), waypoints, motion))
+        now_ns = time.time_ns()
+        untimely = from_the_future(stamp_ns, now_ns)
+        if untimely:
+            return Status.DEGRADED, untimely
+        ahead = (now_ns - stamp_ns) / 1e9
+        prediction = self._motion.predict(max(ahead, 0.0)) if ahead <= LONGEST_PREDICTION else None
+        if prediction is None:
+            return Status.DEGRADED, f"the path is {ahead:.2f} s old: too old to be predicted"
+        self._predicted.put(path(header(now_ns, frame_id), waypoints_through(prediction[0], waypoints)))
+        return Status.OK, "following"

@@ -1,0 +1,282 @@
+"""Many recordings: found, tracked side by side, kept as they finish; one that is broken, dies or hangs stops none."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ropetrace import batch
+from ropetrace.batch import Outcome, ResultFolder, Task, run_batch
+from ropetrace.config import RopeConfig
+from ropetrace.errors import OutputError, RecordingError
+from ropetrace.evaluation import workers
+from ropetrace.recordings.find import find_recordings
+from test_cli import COLOR, Run, rope_frames, run, write_folder, write_mcap
+
+__all__ = ["run"]
+
+ROPE = ("--diameter", "12mm", "--color", COLOR)
+CONFIG = RopeConfig(0.012, COLOR)
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tree of four recordings, a broken one, one that is cut off, and other things."""
+    path = tmp_path_factory.mktemp("samples")
+    for name in ("day1", "day2"):
+        (path / name).mkdir()
+    write_mcap(path / "day1" / "a.mcap", rope_frames(3))
+    write_folder(path / "day1" / "a", rope_frames(3))
+    write_folder(path / "day1" / "a10", rope_frames(3))
+    data = write_mcap(path / "day2" / "a.mcap", rope_frames(4)).read_bytes()
+    (path / "day2" / "cut.mcap").write_bytes(data[: len(data) // 2])
+    (path / "day2" / "broken.mcap").write_bytes(b"nothing")
+    (path / "day2" / "a.mcap.truth.npz").write_bytes(b"")
+    (path / "notes.txt").write_text("a letter")
+    return path
+
+
+@pytest.fixture
+def tree(samples: Path, tmp_path: Path) -> Path:
+    shutil.copytree(samples, tmp_path / "in")
+    return tmp_path / "in"
+
+
+def rows(folder: Path) -> dict[str, dict[str, str]]:
+    with (folder / "summary.csv").open(newline="") as file:
+        return {row["recording"]: row for row in csv.DictReader(file)}
+
+
+def results(folder: Path) -> dict[str, int]:
+    """When each result was written."""
+    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("*.csv")}
+
+
+ALL = ["day1/a", "day1/a10", "day1/a.mcap", "day2/a.mcap", "day2/broken.mcap", "day2/cut.mcap"]
+
+
+@pytest.mark.parametrize(
+    ("patterns", "root", "names"),
+    [
+        (["in/**"], "in", ALL),
+        (["in"], "in", ALL),
+        (["in/*"], "in", ALL),
+        (["in/**/*.mcap"], "in", ["day1/a.mcap", "day2/a.mcap", "day2/broken.mcap", "day2/cut.mcap"]),
+        (["in/day?/a.mcap"], "in", ["day1/a.mcap", "day2/a.mcap"]),
+        (["in/day1/a.mcap", "in/day2/a.mcap", "in/day1/a.mcap"], "in", ["day1/a.mcap", "day2/a.mcap"]),
+        (["in/day1/a"], "in/day1", ["a"]),
+        (["in/day1/a/**"], "in/day1", ["a"]),
+        (["in/notes.txt"], "in", ["notes.txt"]),
+        (["in/day1/*", "in/day1/a"], "in/day1", ["a", "a10", "a.mcap"]),
+    ],
+)
+def test_recordings_are_found_once(
+    tree: Path, monkeypatch: pytest.MonkeyPatch, patterns: list[str], root: str, names: list[str]
+) -> None:
+    monkeypatch.chdir(tree.parent)
+    found = find_recordings(patterns, Path("out"))
+    assert found.root == tree.parent / root
+    assert list(found.recordings) == names
+
+
+def test_a_folder_of_one_recording_is_one(tree: Path) -> None:
+    shutil.rmtree(tree / "day1")
+    (tree / "day2" / "metadata.yaml").touch()
+    (tree / "clouds").mkdir()
+    for name in ("1.npy", "2.npy"):
+        (tree / "clouds" / name).touch()
+    (tree / "loop").symlink_to(tree)
+    assert list(find_recordings([str(tree)], tree / "out").recordings) == ["clouds", "day2"]
+    assert list(find_recordings([str(tree)], tree / "clouds").recordings) == ["day2"]
+    for nothing in ("none", "day*/x", "notes/**"):
+        with pytest.raises(RecordingError, match="no recording is there"):
+            find_recordings([str(tree / nothing)], tree / "out")
+
+
+def test_batch_goes_on_where_it_was(run: Run, tree: Path) -> None:
+    code, out, err = run("batch", "in/**", "--out", "out", *ROPE, "--jobs", 2)
+    assert code == 3
+    assert "recordings 6 (5 finished, 0 of them before, 1 failed, 1 damaged)" in out
+    assert len([line for line in err.splitlines() if line.startswith("day2/")]) == 2
+    out_folder = tree.parent / "out"
+    table = rows(out_folder)
+    assert list(table) == ALL
+    assert (table["day1/a"]["frames"], table["day2/a.mcap"]["frames"]) == ("3", "4")
+    assert table["day1/a"]["error"] == ""
+    assert "without any readable message" in table["day2/broken.mcap"]["error"]
+    assert "damaged" in table["day2/cut.mcap"]["error"]
+    assert all(int(row["ok"]) + int(row["degraded"]) + int(row["lost"]) == int(row["frames"]) for row in table.values())
+    before = results(out_folder)
+    assert sorted(before) == sorted([*(f"{name}.csv" for name in ALL if "broken" not in name), "summary.csv"])
+    assert not list(out_folder.glob(".*"))
+
+    (out_folder / "day1" / "a.csv").unlink()
+    with (out_folder / "summary.csv").open("a") as file:
+        file.write("day1/a10,3,3,0")  # cut off by a kill
+    write_mcap(tree / "new.mcap", rope_frames(2))
+    code, out, _ = run("batch", "in/**", "--out", "out", *ROPE, "--jobs", 1)
+    assert code == 3
+    assert "recordings 7 (6 finished, 4 of them before, 1 failed, 1 damaged)" in out
+    after = results(out_folder)
+    assert after.keys() - before.keys() == {"new.mcap.csv"}
+    assert {name for name in before if after[name] != before[name]} == {"day1/a.csv", "summary.csv"}
+    assert len(rows(out_folder)) == 7
+
+    code, _, err = run("batch", "in/**", "--out", "out", "--diameter", "13mm")
+    assert code == 2
+    assert "begun with other settings" in err
+    (out_folder / "mine.txt").touch()
+    code, out, _ = run("batch", "in/day1/*", "--out", "out", *ROPE, "--format", "npz", "--overwrite", "--jobs", 1)
+    assert code == 0
+    assert sorted(path.name for path in out_folder.rglob("*.*")) == [
+        "a.mcap.npz", "a.npz", "a10.npz", "mine.txt", "settings.toml", "summary.csv",
+    ]  # fmt: skip
+
+
+def test_batch_refuses_in_one_line(run: Run, tree: Path) -> None:
+    (tree / "day1" / "summary").mkdir()
+    shutil.copytree(tree / "day1" / "a", tree / "day1" / "summary", dirs_exist_ok=True)
+    for arguments, words in (
+        (("in/**", "--out", "out"), "diameter is missing"),
+        (("in/**", "--out", "out", "--diameter", "auto"), "auto and @COLUMN,ROW"),
+        (("in/**", "--out", "in/day1/a/out", *ROPE), "lies in, the recording"),
+        (("in/**", "--out", "in", *ROPE), "no recording is there"),
+        (("in/x/**", "--out", "out", *ROPE), "no recording is there"),
+        (("in/**", "--out", "in/notes.txt", *ROPE), "is a file"),
+        (("in/**", "--out", "out", *ROPE, "--jobs", 0), "--jobs 0"),
+        (("in/**", "--out", "out", *ROPE, "--cluster", "x"), "address of a Dask scheduler"),
+        (("in/day1/*", "--out", "out", *ROPE), "summary.csv is the summary"),
+    ):
+        code, _, err = run("batch", *arguments)
+        assert (code, err.count("\n")) == (2, 1), err
+        assert words in err
+    assert [path.name for path in tree.parent.iterdir()] == ["in"]
+
+
+def test_only_one_batch_writes_to_a_folder(tmp_path: Path) -> None:
+    with (
+        ResultFolder(tmp_path / "out", {"a": 1}, overwrite=False),
+        pytest.raises(OutputError, match="being written by another"),
+    ):
+        ResultFolder(tmp_path / "out", {"a": 1}, overwrite=False)
+    ResultFolder(tmp_path / "out", {"a": 1}, overwrite=False).__exit__(None, None, None)
+
+
+def test_names_of_any_bytes_come_back(tmp_path: Path) -> None:
+    outcomes = [Outcome(os.fsdecode(b"\xff,\n\"'"), 1, 1, 0, 0, 0.5, "r", "two\nlines, and a comma")]
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "r").touch()
+    with ResultFolder(tmp_path / "out", {}, overwrite=True) as folder:
+        folder.add(outcomes[0])
+    with ResultFolder(tmp_path / "out", {}, overwrite=False) as folder:
+        assert list(folder.outcomes.values()) == outcomes
+
+
+@dataclass(frozen=True)
+class Deadly:
+    """A path that ends or holds up the process that opens it."""
+
+    hangs: bool
+
+    def __fspath__(self) -> str:
+        if self.hangs:
+            time.sleep(100)
+        os.kill(os.getpid(), signal.SIGKILL)
+        return ""
+
+
+def task(out: Path, name: str, recording: Any) -> Task:
+    return Task(recording, name, out, "csv", CONFIG, {})
+
+
+def test_a_worker_that_dies_or_hangs_fails_its_recording_alone(
+    tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "LONGEST_SILENCE", 8.0)
+    out = tmp_path / "out"
+    told: list[Outcome] = []
+    with ResultFolder(out, {}, overwrite=False) as folder:
+        tasks = [
+            task(out, "dying", Deadly(hangs=False)),
+            task(out, "hanging", Deadly(hangs=True)),
+            task(out, "good", tree / "day1" / "a"),
+            task(out, "broken", tree / "day2" / "broken.mcap"),
+            task(out, "better", tree / "day1" / "a.mcap"),
+        ]
+        run_batch(folder, tasks, jobs=2, on_outcome=told.append)
+        found = {name: outcome.error for name, outcome in folder.outcomes.items()}
+    assert len(told) == 5
+    assert found["dying"] == "its process was killed (SIGKILL)"
+    assert found["hanging"].startswith("it hung")
+    assert "without any readable message" in found["broken"]
+    assert found["good"] == found["better"] == ""
+    assert sorted(path.name for path in out.iterdir()) == ["better.csv", "good.csv", "settings.toml", "summary.csv"]
+
+
+def test_a_result_that_cannot_be_written_is_one_recordings_failure(tmp_path: Path) -> None:
+    outcome = batch.track_task(task(tmp_path, "n" * 300, write_mcap(tmp_path / "b.mcap", rope_frames(2))))
+    assert outcome.failed
+    assert "File name too long" in outcome.error
+
+
+def test_ctrl_c_keeps_what_is_finished(tree: Path) -> None:
+    for index in range(40):
+        shutil.copytree(tree / "day1" / "a", tree / "many" / f"{index}")
+    arguments = ["ropetrace", "batch", "in/many", "--out", "out", *ROPE, "--jobs", "1"]
+    code = f"import sys; from ropetrace import cli; sys.argv = {arguments}; cli.main()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        cwd=tree.parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    out = tree.parent / "out"
+    deadline = time.monotonic() + 60
+    while len(list(out.glob("*.csv"))) < 4 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers get it too
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130, err
+    kept = rows(out)
+    assert err == f"ropetrace: interrupted; {len(kept)} of 40 recordings are finished and kept in out\n"
+    assert 2 <= len(kept) < 40
+    assert not any(row["error"] for row in kept.values())
+    assert sorted(results(out)) == sorted([*(row["result"] for row in kept.values()), "summary.csv"])
+
+
+def test_on_a_dask_cluster_the_results_are_the_same(run: Run, tree: Path) -> None:
+    pytest.importorskip("distributed")
+    # In a process of its own: Dask leaves threads and warnings behind.
+    code = f"""
+import sys
+from distributed import LocalCluster
+from ropetrace import cli
+options = dict(n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None)
+with LocalCluster(host="127.0.0.1", **options) as cluster:
+    address = cluster.scheduler_address
+    sys.argv = ["ropetrace", "batch", "in/**", "--out", "there", *{ROPE!r}, "--cluster", address]
+    cli.main()
+"""
+    process = subprocess.run(
+        [sys.executable, "-c", code], cwd=tree.parent, check=False, capture_output=True, text=True, timeout=100
+    )
+    assert process.returncode == 3, process.stderr
+    assert run("batch", "in/**", "--out", "here", *ROPE)[0] == 3
+    here, there = tree.parent / "here", tree.parent / "there"
+    assert results(here).keys() == results(there).keys()
+    for name in results(here).keys() - {"summary.csv"}:
+        assert (here / name).read_bytes() == (there / name).read_bytes()
+    shown = [{name: {**row, "seconds": ""} for name, row in rows(folder).items()} for folder in (here, there)]
+    assert shown[0] == shown[1]

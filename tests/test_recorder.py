@@ -1,0 +1,422 @@
+"""Recording: nothing that was acknowledged is lost by a kill, and nobody waits for a disk that is slow or full."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from recordings_samples import contents
+from ropetrace.errors import FrameError, OutputError, RecordingError
+from ropetrace.recorder import BackgroundRecorder, Recorder
+from ropetrace.recordings import open_recording
+from ropetrace.recordings.mcap_recover import recover
+from ropetrace.results import open_writer
+from ropetrace.results.base import WholeFile
+from ropetrace.types import CloudFrame, Estimate, Frame, Intrinsics, RgbdFrame
+from test_cli import Run, rope_frames, run, write_mcap
+
+__all__ = ["run"]
+
+CAMERA = Intrinsics(64, 48, 60, 60, 31.5, 23.5)
+
+
+def noise_frame(index: int, kind: Any = np.uint16, unit: float = 0.001, color: bool = True) -> RgbdFrame:
+    """A frame that no compression makes small; the same for the same index."""
+    rng = np.random.default_rng(index)
+    depth = rng.integers(0, 5000, (48, 64)).astype(kind)
+    pixels = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8) if color else None
+    return RgbdFrame(10**18 + index * 33_333_333, depth, unit, CAMERA, pixels)
+
+
+def noise_cloud(index: int, kind: Any, color: bool) -> CloudFrame:
+    rng = np.random.default_rng(index)
+    points = rng.standard_normal((50, 3)).astype(kind)
+    points[7] = np.nan
+    return CloudFrame(index + 1, points, rng.integers(0, 256, (50, 3), dtype=np.uint8) if color else None)
+
+
+def read(path: Path) -> list[Frame]:
+    return [frame for frame in open_recording(path).frames() if isinstance(frame, RgbdFrame | CloudFrame)]
+
+
+def assert_whole(path: Path) -> None:
+    """For other tools too: every checksum and every index."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert sum(1 for _ in reader.iter_messages()) == summary.statistics.message_count
+    recording = open_recording(path)
+    assert recording.info().problems == ()
+
+
+@contextmanager
+def file_limit(size: int) -> Iterator[None]:
+    """No file grows beyond this many bytes, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("color", [True, False])
+@pytest.mark.parametrize(("kind", "unit"), [(np.uint16, 0.001), (np.float32, 1.0)])
+def test_images_come_back_bit_by_bit(tmp_path: Path, kind: Any, unit: float, color: bool) -> None:
+    frames = [noise_frame(index, kind, unit, color) for index in range(5)]
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for frame in frames:
+            recorder.write(frame)
+    assert recorder.frames == 5
+    assert contents(read(tmp_path / "a.mcap")) == contents(frames)
+    assert_whole(tmp_path / "a.mcap")
+
+
+def test_frames_that_repeat_a_stamp_come_back(tmp_path: Path) -> None:
+    frames = [dataclasses.replace(noise_frame(index), stamp_ns=10**18) for index in range(3)]
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for frame in frames:
+            recorder.write(frame)
+    assert contents(read(tmp_path / "a.mcap")) == contents(frames)
+
+
+@pytest.mark.parametrize("color", [True, False])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_clouds_come_back_bit_by_bit(tmp_path: Path, kind: Any, color: bool) -> None:
+    frames = [noise_cloud(index, kind, color) for index in range(3)]
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for frame in frames:
+            recorder.write(frame)
+    for found, frame in zip(read(tmp_path / "a.mcap"), frames, strict=True):
+        assert isinstance(found, CloudFrame)
+        assert found.stamp_ns == frame.stamp_ns
+        assert found.points.dtype == kind
+        np.testing.assert_array_equal(found.points, frame.points)
+        np.testing.assert_array_equal(found.colors, frame.colors)
+    assert_whole(tmp_path / "a.mcap")
+
+
+def test_another_unit_becomes_metres_without_loss(tmp_path: Path) -> None:
+    frame = RgbdFrame(1, np.arange(64 * 48, dtype=np.uint16).reshape(48, 64) * 21, 0.0002, CAMERA)
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.write(frame)
+    (found,) = read(tmp_path / "a.mcap")
+    assert isinstance(found, RgbdFrame)
+    assert found.depth_unit_m == 1
+    np.testing.assert_array_equal(np.rint(found.depth / 0.0002), frame.depth)
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from typing import Any
+from test_recorder import noise_frame
+from ropetrace.recorder import BackgroundRecorder, Recorder
+recorder = Recorder(sys.argv[1])
+background = BackgroundRecorder(recorder) if sys.argv[2] == "behind" else None
+index = 0
+while True:
+    if background is None:
+        recorder.write(noise_frame(index))
+    else:
+        background.put(noise_frame(index))
+    index += 1
+    print(recorder.frames, flush=True)
+"""
+
+
+@pytest.mark.parametrize("attempt", range(2))
+@pytest.mark.parametrize("how", ["write", "behind"])
+def test_kill_minus_nine_loses_no_acknowledged_frame(tmp_path: Path, how: str, attempt: int) -> None:
+    path = tmp_path / "a.mcap"
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, path, how],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    with process:
+        acknowledged = int(process.stdout.readline())
+        end = time.monotonic() + random.uniform(0.05, 0.6)
+        while time.monotonic() < end:
+            acknowledged = int(process.stdout.readline())
+        os.killpg(process.pid, signal.SIGKILL)
+        acknowledged = max([acknowledged, *map(int, process.stdout.read().split())])
+    killed = read(path)
+    assert len(killed) >= acknowledged > 0
+    assert contents(killed) == contents([noise_frame(index) for index in range(len(killed))])
+    recover(path)
+    assert_whole(path)
+    assert contents(read(path)) == contents(killed)
+    assert recover(path).was_whole
+
+
+def test_a_file_that_is_cut_anywhere_is_finished(tmp_path: Path) -> None:
+    frames = [noise_frame(index) for index in range(4)]
+    path, sizes = tmp_path / "a.mcap", []
+    with Recorder(path) as recorder:
+        for frame in frames:
+            recorder.write(frame)
+            recorder.write_estimate(Estimate.lost(frame.stamp_ns, "nothing"))
+            sizes.append(recorder.size)
+    data = path.read_bytes()
+    cuts = {sizes[0], *random.sample(range(sizes[0], len(data)), 30), *range(sizes[-1] - 20, len(data), 97)}
+    for cut in cuts:
+        path.write_bytes(data[:cut])
+        before = read(path)
+        recover(path)
+        assert contents(read(path)) == contents(before)
+        assert len(before) >= sum(size <= cut for size in sizes)
+        assert_whole(path)
+    path.write_bytes(data[: sizes[-1]] + bytes(5000))
+    recover(path)
+    assert path.read_bytes() == data, "zeros, as a power cut leaves them, are no frames"
+
+
+def test_what_cannot_be_finished_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for index in range(4):
+            recorder.write(noise_frame(index))
+            if index == 0:
+                first = recorder.size
+        with pytest.raises(OutputError, match="being written by another"):
+            recover(path)
+        data = bytearray(path.read_bytes())
+    data[first + 200] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match=f"damaged at byte {first}, and whole frames follow"):
+        recover(path)
+    assert path.read_bytes() == data
+    path.write_bytes(data[: first // 2])
+    with pytest.raises(RecordingError, match="no whole frame"):
+        recover(path)
+    path.write_bytes(b"something else altogether")
+    with pytest.raises(RecordingError, match="not an MCAP"):
+        recover(path)
+    with pytest.raises(RecordingError, match="no such file"):
+        recover(tmp_path / "none.mcap")
+
+
+def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with file_limit(100_000), BackgroundRecorder(Recorder(path)) as background:
+        for index in range(30):
+            background.put(noise_frame(index))
+        deadline = time.monotonic() + 10
+        while background.failure is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert not background.offer(noise_frame(30))
+        background.write(30, Estimate.lost(1, "nothing"))
+    assert "File too large" in str(background.failure)
+    written = background.recorder.frames
+    assert 0 < written < 30
+    assert background.dropped == 31 - written
+    assert background.dropped_estimates == 1
+    assert contents(read(path)) == contents([noise_frame(index) for index in range(written)])
+    recover(path)
+    assert_whole(path)
+
+
+def test_a_disk_that_fails_late_ends_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(file: WholeFile) -> None:
+        raise OutputError("a.mcap: cannot be written: Input/output error")
+
+    monkeypatch.setattr("ropetrace.recorder.SYNC_SECONDS", 0.01)
+    monkeypatch.setattr(WholeFile, "sync", fail)
+    recorder = Recorder(tmp_path / "a.mcap")
+
+    def fill() -> None:
+        for index in range(1000):
+            recorder.write(noise_frame(index))
+            time.sleep(0.002)
+
+    with pytest.raises(OutputError, match="Input/output error"):
+        fill()
+    with pytest.raises(OutputError, match="Input/output error"):
+        recorder.close()
+    assert len(read(tmp_path / "a.mcap")) == recorder.frames
+
+
+def test_the_disk_is_made_to_take_it_twice_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    monkeypatch.setattr(WholeFile, "sync", lambda file: calls.append(threading.current_thread().name))
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.write(noise_frame(0))
+        time.sleep(1.2)
+        assert calls == ["recorder sync"] * 2
+
+
+def test_what_does_not_fit_the_queue_is_dropped_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on, write = threading.Event(), Recorder.write
+
+    def slow(recorder: Recorder, frame: Frame) -> None:
+        go_on.wait(10)
+        write(recorder, frame)
+
+    monkeypatch.setattr(Recorder, "write", slow)
+    frame_bytes = 64 * 48 * 5
+    with BackgroundRecorder(Recorder(tmp_path / "a.mcap"), limit=3 * frame_bytes) as background:
+        started = time.monotonic()
+        taken = [background.offer(noise_frame(index)) for index in range(10)]
+        assert time.monotonic() - started < 1, "nobody waits"
+        go_on.set()
+        background.put(noise_frame(10))
+    assert taken == [True] * 3 + [False] * 7
+    assert background.dropped == 7
+    assert contents(read(tmp_path / "a.mcap")) == contents([noise_frame(index) for index in (0, 1, 2, 10)])
+
+
+def test_frames_of_another_camera_are_refused(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.write(noise_frame(0))
+        with pytest.raises(FrameError, match="not that of the first frame"):
+            recorder.write(noise_frame(1, color=False))
+        with pytest.raises(FrameError, match="ROS time"):
+            recorder.write(RgbdFrame(-1, noise_frame(1).depth, 0.001, CAMERA, noise_frame(1).color))
+        recorder.write(noise_frame(2))
+    assert contents(read(tmp_path / "a.mcap")) == contents([noise_frame(0), noise_frame(2)])
+    with BackgroundRecorder(Recorder(tmp_path / "b.mcap")) as background:
+        background.put(noise_frame(0))
+        background.put(noise_frame(1, color=False))
+    assert background.failure is None
+    assert sum(background.refused.values()) == 1
+
+
+def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"mine")
+    with pytest.raises(OutputError, match="exists already"):
+        Recorder(path)
+    assert path.read_bytes() == b"mine"
+    with Recorder(path, overwrite=True) as recorder:
+        recorder.write(noise_frame(0))
+        with pytest.raises(OutputError, match="being written by another"):
+            Recorder(path, overwrite=True)
+        with pytest.raises(OutputError, match="being written by another"):
+            open_writer(path, overwrite=True)
+    assert len(read(path)) == 1
+
+
+# The commands
+
+
+def messages(path: Path) -> list[tuple[str, int, bytes]]:
+    with path.open("rb") as stream:
+        return [
+            (channel.topic, message.log_time, message.data)
+            for _, channel, message in make_reader(stream).iter_messages()
+            if channel.topic.startswith("/ropetrace")
+        ]
+
+
+def test_record_with_a_rope_has_the_results_of_track(run: Run, tmp_path: Path) -> None:
+    source = write_mcap(tmp_path / "in.mcap", rope_frames())
+    rope = ("--diameter", "12mm", "--color", "#c8281e")
+    assert run("track", source, *rope, "--out", "track.mcap")[0] == 0
+    code, out, _ = run("record", source, *rope, "--out", "record.mcap")
+    assert code == 0
+    assert "recorded  8 frames" in out
+    assert messages(tmp_path / "record.mcap") == messages(tmp_path / "track.mcap") != []
+    assert contents(read(tmp_path / "record.mcap")) == contents(rope_frames())
+    assert_whole(tmp_path / "record.mcap")
+    assert run("recover", "record.mcap") == (0, "record.mcap is whole: 64 messages; nothing was changed\n", "")
+    (tmp_path / "record.mcap").write_bytes((tmp_path / "record.mcap").read_bytes()[:-1000])
+    code, out, _ = run("recover", "record.mcap")
+    assert code == 0
+    assert "finished" in out
+
+
+def test_record_refuses_in_one_line(run: Run, tmp_path: Path) -> None:
+    source = write_mcap(tmp_path / "in.mcap", rope_frames(2))
+    for arguments, words in (
+        (("in.mcap", "--out", "out.csv"), "out.csv: a recording is an .mcap file"),
+        (("in.mcap", "--out", "in.mcap", "--overwrite"), "belongs to, the input"),
+        (("in.mcap", "--out", "none/out.mcap"), "does not exist"),
+        (("in.mcap", "--out", "out.mcap", "--color", "#c8281e"), "diameter is missing"),
+        (("none", "--out", "out.mcap"), "cannot be read"),
+        (("in.mcap", "--out", "out.mcap", "--start", 9), "no frame was recorded"),
+    ):
+        code, _, err = run("record", *arguments)
+        assert (code, err.count("\n")) == (1 if "no frame" in words else 2, 1)
+        assert words in err
+    assert [path.name for path in tmp_path.iterdir()] == ["in.mcap"]
+    assert len(read(source)) == 2
+
+
+def test_record_tells_what_is_missing(run: Run, tmp_path: Path) -> None:
+    data = write_mcap(tmp_path / "in.mcap", rope_frames(4)).read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
+    code, out, err = run("record", "cut.mcap", "--out", "out.mcap")
+    assert code == 3
+    assert "damage" in out
+    assert "part of the frames" in err
+    assert_whole(tmp_path / "out.mcap")
+
+
+def test_record_on_a_full_disk_says_so(run: Run, tmp_path: Path) -> None:
+    with Recorder(tmp_path / "in.mcap") as recorder:
+        for index in range(20):
+            recorder.write(noise_frame(index))
+    with file_limit(100_000):
+        code, out, err = run("record", "in.mcap", "--out", "out.mcap")
+    assert code == 2
+    assert "dropped" in out
+    assert err == "ropetrace: out.mcap: cannot be written: File too large; what was recorded before is kept\n"
+    assert len(read(tmp_path / "out.mcap")) >= 3
+
+
+SLOW = """
+import sys, time
+from ropetrace import cli
+from ropetrace.recordings.ros_recording import RosRecording
+frames = RosRecording.frames
+def slow(*arguments):
+    for frame in frames(*arguments):
+        time.sleep(0.05)
+        yield frame
+RosRecording.frames = slow
+sys.argv = ["ropetrace", "record", "in.mcap", "--out", "out.mcap"]
+cli.main()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_leaves_a_whole_file(tmp_path: Path, number: signal.Signals) -> None:
+    with Recorder(tmp_path / "in.mcap") as recorder:
+        for index in range(200):
+            recorder.write(noise_frame(index))
+    process = subprocess.Popen(
+        [sys.executable, "-c", SLOW], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    out = tmp_path / "out.mcap"
+    deadline = time.monotonic() + 30
+    while (not out.exists() or out.stat().st_size < 50_000) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert err == "ropetrace: interrupted; what was recorded until then is kept\n"
+    found = read(out)
+    assert contents(found) == contents([noise_frame(index) for index in range(len(found))])
+    assert 2 <= len(found) < 200
+    assert_whole(out)

@@ -1,0 +1,187 @@
+"""The whole graph, each node a process of its own: it works, and outlives the end of any of them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("zenoh")
+pytest.importorskip("mujoco")
+pytest.importorskip("pinocchio")
+
+from ropetrace.cli_node import Images, Joints, Reach, Router
+from ropetrace.errors import ConfigError
+from ropetrace.recordings.ros_messages import RawMessage, decoded
+from ropetrace.results.ros_estimates import PATH, TRAJECTORY
+from ropetrace.ros2.kinematic_system import ArmSettings
+from ropetrace.ros2.live_camera import CameraTopics
+from ropetrace.ros2.messages import JOINTS, NUMBERS
+from ropetrace.ros2.session import Connection
+from ropetrace.ros2.simulated_cell import cell_config
+from ropetrace.ros2.topics import RosNode, Subscription
+from ros2_rig import free_endpoint, until
+
+STARTED = 60.0
+"""A node with its kernels is up within this, seconds: the machine may be busy."""
+
+NODES = ("sim", "track_deformable", "trajectory_tracker", "kinematic_system")
+
+
+class Graph:
+    """The processes by name."""
+
+    def __init__(self, folder: Path) -> None:
+        self.router = free_endpoint()
+        self.log = folder / "log.txt"
+        self._settings = folder / "rope.toml"
+        self._settings.write_text(cell_config().to_toml())
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, name: str) -> None:
+        told = [] if name in ("router", "sim") else ["--config", str(self._settings)]
+        command = [sys.executable, "-m", "ropetrace", "node", name, "--router", self.router, *told]
+        with self.log.open("ab") as log:
+            self.running[name] = subprocess.Popen(command, stderr=log)
+
+    def kill(self, name: str) -> None:
+        process = self.running.pop(name)
+        process.kill()
+        process.wait()
+
+    def end(self) -> dict[str, int]:
+        for process in self.running.values():
+            process.send_signal(signal.SIGINT)
+        return {name: process.wait(timeout=30) for name, process in self.running.items()}
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Iterator[Graph]:
+    made = Graph(tmp_path)
+    try:
+        for name in ("router", *NODES):
+            made.start(name)
+        yield made
+    finally:
+        for process in made.running.values():
+            process.kill()
+            process.wait()
+
+
+def enough(read: Subscription) -> list[RawMessage]:
+    """Five messages."""
+    got: list[RawMessage] = []
+
+    def all_came() -> bool:
+        got.extend(read.take())
+        return len(got) >= 5
+
+    until(all_came, STARTED)
+    return got
+
+
+def test_the_graph_traces_the_rope_and_outlives_each_of_its_nodes(graph: Graph) -> None:
+    with RosNode("watcher", Connection(router=graph.router)) as watcher:
+        reads = {
+            "path": watcher.subscription("/ropetrace/centerline", PATH, depth=1000),
+            "motion": watcher.subscription("/ropetrace/motion", TRAJECTORY, depth=1000),
+            "command": watcher.subscription("/ropetrace/velocity_commands", NUMBERS, depth=1000),
+            "joints": watcher.subscription("/joint_states", JOINTS, depth=1000),
+        }
+
+        def flows() -> None:
+            """Everything comes: five new messages of each topic, the newest path with poses."""
+            for read in reads.values():
+                read.take()
+            for name, read in reads.items():
+                got = enough(read)
+                if name == "path":
+                    assert len(decoded(got[-1]).poses) > 50
+
+        flows()
+        until(lambda: "kinematic_system: ok: done" in graph.log.read_text(), STARTED)
+        for name in (*NODES, "router"):
+            graph.kill(name)
+            time.sleep(1.5)
+            graph.start(name)
+            flows()
+        # Whoever comes after a router that was started anew is found, too.
+        graph.kill("trajectory_tracker")
+        graph.start("trajectory_tracker")
+        flows()
+    assert set(graph.end().values()) == {0}
+    text = graph.log.read_text()
+    assert "Traceback" not in text, text
+    assert text.count("ended") == len(NODES), "the router says nothing"
+
+
+def test_all_starts_the_graph_and_ctrl_c_ends_it(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    command = [sys.executable, "-m", "ropetrace", "node", "all", "--simulate", "--router", endpoint]
+    log = tmp_path / "log.txt"
+    with log.open("wb") as out:
+        process = subprocess.Popen(command, stderr=out)
+    try:
+        until(lambda: "kinematic_system: ok" in log.read_text(), STARTED)
+        children = children_of(process.pid)
+        assert len(children) == 5
+        os.kill(children[-1], signal.SIGKILL)
+        until(lambda: "it is started again" in log.read_text())
+        until(lambda: len(children_of(process.pid)) == 5, STARTED)
+        children = children_of(process.pid)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 0
+    finally:
+        process.kill()
+        process.wait()
+    assert not [child for child in children if os.path.exists(f"/proc/{child}")]
+    assert "Traceback" not in log.read_text(), log.read_text()
+
+
+def children_of(pid: int) -> list[int]:
+    with open(f"/proc/{pid}/task/{pid}/children", encoding="ascii") as file:
+        return [int(child) for child in file.read().split()]
+
+
+def test_the_command_line_has_the_defaults_of_the_nodes() -> None:
+    images = Images()
+    assert CameraTopics() == CameraTopics(
+        images.depth_topic, images.color_topic, images.camera_topic, images.cloud_topic
+    )
+    assert ArmSettings() == ArmSettings(**asdict(Joints()))
+    reach = Reach()
+    assert Connection() == Connection(reach.router, reach.mode, reach.listen, reach.multicast, 0, reach.humble)
+    assert Router().router == reach.router
+
+
+def test_a_domain_of_the_environment_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "five")
+    with pytest.raises(ConfigError, match="ROS_DOMAIN_ID"):
+        Reach(router=free_endpoint()).node("node")
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        (["kinematic_system", "--diameter", "15mm"], "camera_pose"),
+        (["all", "--diameter", "15mm"], "camera_pose"),
+        (["track_deformable"], "diameter is missing"),
+        (["track_deformable", "--diameter", "15mm", "--depth-topic", "depth"], "no full name of a topic"),
+        (["trajectory_tracker", "--diameter", "15mm", "--domain", "999"], "0 to 232"),
+        (["router", "--router", "tcp/203.0.113.1:7447"], "no Zenoh session"),
+    ],
+)
+def test_what_is_wrong_is_one_line(told: list[str], said: str) -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "ropetrace", "node", *told], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert result.returncode == 2
+    assert said in result.stderr.splitlines()[-1]
+    assert "Traceback" not in result.stderr

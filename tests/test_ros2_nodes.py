@@ -1,0 +1,391 @@
+"""The nodes of live ROS 2, one at a time: what they make of what comes, and of what does not."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("zenoh")
+pytest.importorskip("mujoco")
+pytest.importorskip("pinocchio")
+
+from ropetrace.control.arm import Arm
+from ropetrace.errors import ConfigError, FrameError
+from ropetrace.evaluation.case1 import CONDITIONS, Case1Settings, scenario
+from ropetrace.evaluation.case2 import PLACEMENTS
+from ropetrace.evaluation.metrics import symmetric_mean
+from ropetrace.recordings.ros_frames import CLOUD_TOPIC, COLOR_TOPIC, DEPTH_TOPIC, frame_messages
+from ropetrace.recordings.ros_messages import CLOUD, IMAGE, RawMessage, decoded, stamp_and_frame
+from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, header, make, path, trajectory, typestore
+from ropetrace.ros2 import messages
+from ropetrace.ros2.kinematic_system import ArmSettings, KinematicSystem
+from ropetrace.ros2.live_camera import CameraTopics
+from ropetrace.ros2.messages import JOINTS, NUMBERS, POSES
+from ropetrace.ros2.simulated_cell import cell_config
+from ropetrace.ros2.topics import Publisher, RosNode, Subscription
+from ropetrace.ros2.track_deformable import TrackDeformable
+from ropetrace.ros2.trajectory_tracker import TrajectoryTracker
+from ropetrace.sim.scenario import SimulatedScene
+from ropetrace.types import CloudFrame, FloatArray, Frame, Motion, RgbdFrame, Waypoints
+from ros2_rig import routed, until
+
+PANDA = Arm.named("panda")
+START = np.array(PLACEMENTS["behind"].start)
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[RgbdFrame, FloatArray]:
+    """A rope that hangs still, and where it is."""
+    simulated = SimulatedScene(scenario(CONDITIONS[0], 0.0, Case1Settings()))
+    frame = simulated.camera.expose(simulated.scene_at, simulated.camera.stamp(1), 1)
+    return frame, simulated.truth().polyline
+
+
+class Sender:
+    """A camera: sends frames with the stamps that they are given."""
+
+    def __init__(self, node: RosNode) -> None:
+        self._node = node
+        self._publishers: dict[str, Publisher] = {}
+
+    def send(self, frame: Frame, ahead: float = 0.0, without: str = "") -> None:
+        for message in frame_messages(replace(frame, stamp_ns=time.time_ns() + round(ahead * 1e9))):
+            if message.topic == without:
+                continue
+            if message.topic not in self._publishers:
+                self._publishers[message.topic] = self._node.publisher(message.topic, message.type)
+            self._publishers[message.topic].put_packed(bytes(message.data))
+        time.sleep(0.03)
+
+
+@contextmanager
+def running(node: Any) -> Iterator[None]:
+    """A node that runs beside the test."""
+    stop = threading.Event()
+    thread = threading.Thread(target=node.run, args=(stop.is_set,))
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+@contextmanager
+def graph() -> Iterator[tuple[RosNode, RosNode]]:
+    """A node under test, and one beside it."""
+    with routed() as connection, RosNode("tested", connection) as tested, RosNode("beside", connection) as beside:
+        yield tested, beside
+
+
+def says(read: Subscription, words: str, do: Callable[[], None] = lambda: None) -> Callable[[], bool]:
+    def heard() -> bool:
+        do()
+        time.sleep(0.01)
+        return any(words in decoded(message).status[0].message for message in read.take())
+
+    return heard
+
+
+def tracked(camera: Sender, frame: Frame, paths: Subscription) -> Callable[[], bool]:
+    def found() -> bool:
+        camera.send(frame)
+        return poses(paths.newest()) > 10
+
+    return found
+
+
+def poses(message: RawMessage | None) -> int:
+    return -1 if message is None else len(decoded(message).poses)
+
+
+def test_images_become_a_path_poses_and_a_status(scene: tuple[RgbdFrame, FloatArray]) -> None:
+    frame, truth = scene
+    with graph() as (node, beside):
+        camera = Sender(beside)
+        paths, arrays = (
+            beside.subscription("/ropetrace/centerline", PATH),
+            beside.subscription("/ropetrace/poses", POSES),
+        )
+        statuses = beside.subscription("/ropetrace/status", DIAGNOSTICS)
+        with running(TrackDeformable(node, cell_config())):
+            newest: dict[str, RawMessage] = {}
+
+            def found() -> bool:
+                camera.send(frame)
+                for read in (paths, arrays, statuses):
+                    message = read.newest()
+                    if message is not None:
+                        newest[read.type] = message
+                # The first image may come before its camera_info.
+                return len(newest) == 3 and poses(newest[PATH]) > 10
+
+            until(found)
+        waypoints = messages.waypoints(newest[PATH])
+        assert symmetric_mean(waypoints.positions, truth) < 0.003, "metres"
+        assert stamp_and_frame(newest[PATH])[1] == "camera_color_optical_frame"
+        assert abs(time.time_ns() - stamp_and_frame(newest[PATH])[0]) < 60e9
+        assert len(decoded(newest[POSES]).poses) == len(waypoints)
+        status = decoded(newest[DIAGNOSTICS]).status[0]
+        assert status.level == status.OK
+        values = {pair.key: pair.value for pair in status.values}
+        assert values["status"] == "ok"
+        assert float(values["length"]) == pytest.approx(waypoints.length, rel=0.01)
+
+
+def test_clouds_become_a_path(scene: tuple[RgbdFrame, FloatArray]) -> None:
+    frame, truth = scene
+    lens = frame.intrinsics
+    rows, columns = np.nonzero((frame.depth > 0) & np.isfinite(frame.depth) & (frame.color[:, :, 0] > 60))  # type: ignore[index]
+    depth = frame.depth[rows, columns]
+    points = np.stack([(columns - lens.cx) / lens.fx * depth, (rows - lens.cy) / lens.fy * depth, depth], axis=1)
+    assert frame.color is not None
+    cloud = CloudFrame(0, points.astype(np.float32), frame.color[rows, columns])
+    with graph() as (node, beside):
+        camera, paths = Sender(beside), beside.subscription("/ropetrace/centerline", PATH)
+        with running(TrackDeformable(node, cell_config(), CameraTopics(cloud=CLOUD_TOPIC))):
+            got: list[RawMessage] = []
+
+            def found() -> bool:
+                camera.send(cloud)
+                got.extend(message for message in paths.take() if poses(message) > 1)
+                return bool(got)
+
+            until(found)
+        assert symmetric_mean(messages.waypoints(got[-1]).positions, truth) < 0.003, "metres"
+
+
+def test_a_camera_of_the_wrong_type_is_told(scene: tuple[RgbdFrame, FloatArray]) -> None:
+    with graph() as (node, beside):
+        heard = beside.subscription("/diagnostics", DIAGNOSTICS, depth=100)
+        beside.publisher(DEPTH_TOPIC, CLOUD)
+        with running(TrackDeformable(node, cell_config())):
+            until(
+                says(heard, f"{DEPTH_TOPIC} of node beside is sensor_msgs/msg/PointCloud2, expected {IMAGE}: not read")
+            )
+
+
+def test_a_stamp_from_the_future_is_told(scene: tuple[RgbdFrame, FloatArray]) -> None:
+    with graph() as (node, beside):
+        camera, heard = Sender(beside), beside.subscription("/diagnostics", DIAGNOSTICS, depth=100)
+        with running(TrackDeformable(node, cell_config())):
+            until(says(heard, "s in the future: the clocks", lambda: camera.send(scene[0], ahead=5.0)))
+            until(says(heard, "tracking", lambda: camera.send(scene[0])))
+
+
+def test_a_camera_may_change_its_size(scene: tuple[RgbdFrame, FloatArray]) -> None:
+    frame = scene[0]
+    lens = frame.intrinsics
+    assert frame.color is not None
+    smaller = RgbdFrame(
+        0,
+        np.ascontiguousarray(frame.depth[::2, ::2]),
+        frame.depth_unit_m,
+        replace(
+            lens, width=lens.width // 2, height=lens.height // 2, fx=lens.fx / 2, fy=lens.fy / 2,
+            cx=lens.cx / 2, cy=lens.cy / 2,
+        ),
+        np.ascontiguousarray(frame.color[::2, ::2]),
+    )  # fmt: skip
+    with graph() as (node, beside):
+        camera, paths = Sender(beside), beside.subscription("/ropetrace/centerline", PATH, depth=1000)
+        with running(TrackDeformable(node, cell_config())):
+            for shown in (frame, smaller, frame, smaller):
+                for _ in range(5):
+                    camera.send(shown)
+                paths.take()
+                until(tracked(camera, shown, paths))
+            # Images of one size with the camera_info of another are told, not tracked.
+            wrong = frame_messages(replace(frame, stamp_ns=time.time_ns()))
+            heard = beside.subscription("/diagnostics", DIAGNOSTICS, depth=100)
+            senders = {
+                message.topic: beside.publisher(message.topic, message.type)
+                for message in wrong
+                if message.type == IMAGE
+            }
+
+            def mixed() -> None:
+                for message in frame_messages(replace(frame, stamp_ns=time.time_ns())):
+                    if message.topic in senders:
+                        senders[message.topic].put_packed(bytes(message.data))
+
+            until(says(heard, "its intrinsics are for 240x180", mixed))
+
+
+def test_a_camera_that_vanishes_is_told_and_one_that_returns_is_tracked(scene: tuple[RgbdFrame, FloatArray]) -> None:
+    with routed() as connection, RosNode("tested", connection) as node, RosNode("reader", connection) as reader:
+        heard = reader.subscription("/diagnostics", DIAGNOSTICS, depth=100)
+        paths = reader.subscription("/ropetrace/centerline", PATH, depth=1000)
+        with running(TrackDeformable(node, cell_config())):
+            for _ in range(2):
+                with RosNode("camera", connection) as beside:
+                    camera = Sender(beside)
+                    until(tracked(camera, scene[0], paths))
+                until(says(heard, f"nothing came on {DEPTH_TOPIC} for"))
+
+
+def test_depth_without_its_colour_or_camera_is_told(scene: tuple[RgbdFrame, FloatArray]) -> None:
+    with graph() as (node, beside):
+        camera, heard = Sender(beside), beside.subscription("/diagnostics", DIAGNOSTICS, depth=100)
+        info = DEPTH_TOPIC.rsplit("/", 1)[0] + "/camera_info"
+        with running(TrackDeformable(node, cell_config())):
+            until(says(heard, f"no camera_info yet on {info}", lambda: camera.send(scene[0], without=info)))
+            until(says(heard, "no colour image within 20 ms", lambda: camera.send(scene[0], without=COLOR_TOPIC)))
+
+
+def test_damaged_messages_are_told_and_survived(scene: tuple[RgbdFrame, FloatArray]) -> None:
+    with graph() as (node, beside):
+        camera, heard = Sender(beside), beside.subscription("/diagnostics", DIAGNOSTICS, depth=100)
+        damaged = beside.publisher(DEPTH_TOPIC, IMAGE)
+        with running(TrackDeformable(node, cell_config())):
+            until(says(heard, "has no whole header", lambda: damaged.put_packed(b"\x00\x01\x00\x00abc")))
+            until(says(heard, "tracking", lambda: camera.send(scene[0])))
+
+
+def test_topics_that_are_the_same() -> None:
+    with pytest.raises(ConfigError, match="a topic of its own"):
+        CameraTopics(depth="/a", color="/a")
+
+
+def straight(shift: float) -> Waypoints:
+    positions = np.stack([np.full(50, shift), np.zeros(50), np.linspace(1.0, 1.49, 50)], axis=1)
+    return Waypoints(positions, np.tile([0.0, 0.0, 0.0, 1.0], (50, 1)), positions[:, 2] - 1.0)
+
+
+def test_paths_become_velocities_and_a_prediction() -> None:
+    speed = 0.3
+    with graph() as (node, beside):
+        sent = beside.publisher("/ropetrace/centerline", PATH)
+        moving = beside.subscription("/ropetrace/motion", TRAJECTORY, depth=1000)
+        predicted = beside.subscription("/ropetrace/predicted", PATH, depth=1000)
+        heard = beside.subscription("/diagnostics", DIAGNOSTICS, depth=100)
+        began = time.time()
+        with running(TrajectoryTracker(node, cell_config())):
+            for _ in range(90):
+                now = time.time()
+                sent.put(path(header(round(now * 1e9), "camera"), straight(speed * (now - began))))
+                time.sleep(1 / 30)
+            known = messages.moving_waypoints(moving.take()[-1])
+            assert known is not None
+            assert np.abs(known[1].velocities - [speed, 0, 0]).max() < 0.02, "m/s"
+            last = predicted.take()[-1]
+            stamp, frame_id = stamp_and_frame(last)
+            assert frame_id == "camera"
+            # A sleep that is not exact is no error: the prediction is for its own stamp.
+            assert np.abs(messages.waypoints(last).positions[:, 0] - speed * (stamp / 1e9 - began)).max() < 0.003
+            until(says(heard, "the rope is lost", lambda: sent.put(path(header(time.time_ns(), ""), Waypoints.none()))))
+            until(says(heard, "nothing came on /ropetrace/centerline"))
+            one = make(PATH, header(time.time_ns(), ""), decoded(last).poses[:1])
+            until(says(heard, "1 poses: expected none, or 2", lambda: sent.put(one)))
+
+
+def test_no_motion_is_no_trajectory_tracker() -> None:
+    config = cell_config()
+    with graph() as (node, _), pytest.raises(ConfigError, match="needs the motion"):
+        TrajectoryTracker(node, replace(config, motion=replace(config.motion, method="none")))
+
+
+class ArmAndRope:
+    """An arm that does exactly as it is told, and a rope at rest: both sent by `beside`."""
+
+    def __init__(self, beside: RosNode) -> None:
+        self.position = START.copy()
+        self._joints = beside.publisher("/joint_states", JOINTS)
+        self._paths = beside.publisher("/ropetrace/centerline", PATH)
+        self._moving = beside.publisher("/ropetrace/motion", TRAJECTORY)
+        self._camera_from_base = np.linalg.inv(cell_config().world_from_camera())
+        tool = PANDA.forward(START)[:3, 3]
+        offsets = np.linspace(-0.02, 0.4, 80)[:, None] * [0.0, 0.0, -1.0]
+        points = (tool + offsets) @ self._camera_from_base[:3, :3].T + self._camera_from_base[:3, 3]
+        turns = np.tile([0.0, 0.0, 0.0, 1.0], (80, 1))
+        self._rope = Waypoints(points, turns, np.linspace(0, 0.42, 80))
+
+    def send_joints(self) -> None:
+        held = header(time.time_ns(), "")
+        self._joints.put(messages.joint_state(held, PANDA.joint_names, self.position, np.zeros(7)))
+
+    def send_rope(self) -> None:
+        held, still = header(time.time_ns(), "camera"), np.zeros((80, 3))
+        self._moving.put(trajectory(held, self._rope, Motion(still, still, still, still, still)))
+
+    def send_lost(self) -> None:
+        self._paths.put(path(header(time.time_ns(), "camera"), Waypoints.none()))
+
+
+def drive(system: KinematicSystem, cell: ArmAndRope, seconds: float, joints: bool = True, rope: bool = True) -> Any:
+    """Steps in real time; the last command."""
+    command = None
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if joints:
+            cell.send_joints()
+        if rope:
+            cell.send_rope()
+        time.sleep(0.002)
+        command = system.step(time.time())
+        if command is not None:
+            cell.position = cell.position + system.period * command.velocity
+        time.sleep(max(system.period - 0.003, 0.0))
+    return command
+
+
+def test_the_arm_moves_only_while_all_is_known() -> None:
+    with graph() as (node, beside):
+        cell = ArmAndRope(beside)
+        velocities = beside.subscription("/ropetrace/velocity_commands", NUMBERS, depth=10_000)
+        named = beside.subscription("/ropetrace/joint_commands", JOINTS, depth=10_000)
+        system = KinematicSystem(node, cell_config().world_from_camera(), ArmSettings(rate=50))
+        assert drive(system, cell, 0.5, joints=False) is None
+        assert velocities.take() == []
+
+        until(lambda: np.abs(getattr(drive(system, cell, 0.3), "velocity", 0.0)).max() > 0.01)
+        until(lambda: len(named.take()) > 0 and len(velocities.take()) > 0)
+
+        # A rope that is not seen any more stops the arm, and one that is seen again is traced.
+        command = drive(system, cell, 1.0, rope=False)
+        assert not command.velocity.any()
+        assert "old" in command.text
+        until(lambda: np.abs(drive(system, cell, 0.2).velocity).max() > 0.01)
+
+        # So do frames in which it is lost.
+        def lost() -> bool:
+            drive(system, cell, 0.05)
+            for _ in range(4):
+                cell.send_lost()
+            cell.send_joints()
+            time.sleep(0.005)
+            command = system.step(time.time())
+            return command is not None and "the rope is lost" in command.text
+
+        until(lost)
+
+        # An arm that is not heard any more is braked; when it is back elsewhere, all begins anew from there.
+        command = drive(system, cell, 0.7, joints=False)
+        assert not command.velocity.any()
+        until(lambda: drive(system, cell, 0.3, joints=False) is None)
+        cell.position = START + 0.3 * (np.arange(7) == 6)
+        until(lambda: drive(system, cell, 0.2) is not None)
+        assert "apart" not in drive(system, cell, 0.5).text
+
+
+def test_a_joint_that_is_missing_is_told() -> None:
+    state = messages.joint_state(header(1, ""), ("a", "b"), np.array([1.0, 2.0]), None)
+    message = RawMessage("/joint_states", JOINTS, "cdr", 0, bytes(typestore().serialize_cdr(state, JOINTS)))
+    assert messages.joint_values(message, ("b", "a"), "position").tolist() == [2.0, 1.0]
+    with pytest.raises(FrameError, match="the joint c is not in it: a, b"):
+        messages.joint_values(message, ("c",), "position")
+    with pytest.raises(FrameError, match="2 joints, but 0 of velocity"):
+        messages.joint_values(message, ("a",), "velocity")
+
+
+@pytest.mark.parametrize("wrong", [{"rate": 0.5}, {"rate": float("nan")}, {"joint_topic": "joints"}])
+def test_an_arm_that_cannot_be(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        ArmSettings(**wrong)
