@@ -230,8 +230,7 @@ class PersistentTracker:
             pieces[-1].append(run)
         pieces = [[run for run in piece if len(run) > 1] for piece in pieces]
         if self.config.ropes == "auto":
-            pieces = [[run] for piece in pieces for run in piece]
-            pieces = [piece for piece in pieces if len(piece[0]) >= _NEW_ROPE]
+            pieces = [piece for piece in pieces if sum(map(len, piece)) >= _NEW_ROPE]
         pieces.sort(key=lambda piece: -sum(int(slices.counts[run].sum()) for run in piece))
         return [piece for piece in pieces if piece]
 
