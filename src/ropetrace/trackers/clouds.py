@@ -82,7 +82,12 @@ def evenly_along(chain: FloatArray, count: int) -> FloatArray:
     """`count` points at equal arc length along a chain, both (., 3) and in metres, its ends among them."""
     arc = arc_lengths(chain)
     places = np.linspace(0, arc[-1], count)
-    return np.stack([np.interp(places, arc, chain[:, axis]) for axis in range(3)], axis=1)
+    return interpolated(places, arc, chain)
+
+
+def interpolated(places: FloatArray, knots: FloatArray, rows: FloatArray) -> FloatArray:
+    """Rows, (K, 3), interpolated from their growing knots, (K,), to other places, (P, 3)."""
+    return np.stack([np.interp(places, knots, rows[:, axis]) for axis in range(3)], axis=1)
 
 
 def walk(polyline: FloatArray, strides: FloatArray) -> FloatArray:

@@ -24,9 +24,9 @@ from ropetrace.trackers.clouds import (
     nearest_nodes,
     voxel_grid,
 )
-from ropetrace.trackers.doubts import Doubts, sharpest_turn
+from ropetrace.trackers.doubts import KINK, Doubts, sharpest_turn
 from ropetrace.trackers.registration import Fit, RegistrationError
-from ropetrace.trackers.slicing import SlicingTracker
+from ropetrace.trackers.slicing import SlicingTracker, thinned
 from ropetrace.types import BadFrame, Cloud, Estimate, FloatArray, Frame, Status, Waypoints
 
 RESTART_AFTER = 3
@@ -64,9 +64,6 @@ _CROWDED = 0.6
 
 _CROWD = 5
 """Distances in a row that are looked at for that."""
-
-_KINK = np.radians(100)
-"""No rope turns by more than this from one node to the next."""
 
 
 class NodeTracker(ABC):
@@ -132,7 +129,7 @@ class NodeTracker(ABC):
         lap("segmentation")
         self._points = points
         if stride > 1:
-            reasons.append(f"{count} points passed, one in {stride} is used: narrow the colour or the position box")
+            reasons.append(thinned(count, stride))
         if len(cloud) > _MOST_VOXELS:
             skip = -(-len(cloud) // _MOST_VOXELS)
             reasons.append(f"{len(cloud)} voxels, one in {skip} is used: background passes, or the voxels are small")
@@ -239,7 +236,7 @@ class NodeTracker(ABC):
         if unexplained > _UNEXPLAINED:
             share = f"{unexplained * 100:.0f} %"
             trouble.append(f"{share} of the points lie farther than {reach * 1e3:.0f} mm from the curve")
-        if sharpest_turn(fit.nodes) > _KINK:
+        if sharpest_turn(fit.nodes) > KINK:
             trouble.append("the curve turns back sharply: the order there may be wrong")
         spread = np.convolve(_steps(fit.nodes) / self._strides, np.full(_CROWD, 1 / _CROWD), "valid")
         if spread.min() < _CROWDED * spread.mean():

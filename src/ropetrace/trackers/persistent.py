@@ -17,11 +17,19 @@ from ropetrace.centerline import make_waypoints
 from ropetrace.config import RopeConfig
 from ropetrace.ordering import runs_backwards, starts_at_end
 from ropetrace.trackers.base import Lap, Mask, no_lap
-from ropetrace.trackers.clouds import arc_lengths, evenly_along, nearest_distances, nearest_nodes
+from ropetrace.trackers.clouds import arc_lengths, evenly_along, interpolated, nearest_distances, nearest_nodes
 from ropetrace.trackers.doubts import KINK, Doubts, sharpest_turn
 from ropetrace.trackers.placement import SAME_LENGTH, Expected, Placed, place
 from ropetrace.trackers.sight import is_behind, looked_through, sees_past
-from ropetrace.trackers.slicing import BRIDGE_DIAMETERS, SURFACE_NEIGHBOURS, SlicingTracker, too_little
+from ropetrace.trackers.slicing import (
+    A_SURFACE,
+    BRIDGE_DIAMETERS,
+    SURFACE_NEIGHBOURS,
+    SlicingTracker,
+    thinned,
+    too_little,
+    too_many,
+)
 from ropetrace.trackers.strands import BREAK, Path, Strand, path_through, sliced_apart, strand_of, strands_of
 from ropetrace.trackers.whole_rope import (
     MOST_SIGMA,
@@ -159,7 +167,7 @@ class PersistentTracker:
         points, count, stride = self._slicing.rope_points(frame)
         self._points = points
         if stride > 1:
-            reasons.append(f"{count} points passed, one in {stride} is used: narrow the colour or the position box")
+            reasons.append(thinned(count, stride))
         lap("segmentation")
         view = _View(frame, points, count, stride, reasons)
         slices = self._slicing.slicer.slice(points)
@@ -168,16 +176,13 @@ class PersistentTracker:
             slices = sliced_apart(points, slices, self._slicing.slicer, BREAK * self.config.diameter)
         lap("slicing")
         if slices.capped:
-            reasons.append(
-                f"more than {self._slicing.slicer.max_nodes} slices: background is taken for rope, or the diameter is "
-                "too small"
-            )
+            reasons.append(too_many(self._slicing.slicer.max_nodes))
         if len(slices) < 2:
             return view
         diameter = self.config.diameter
         view.path = path_through(slices, diameter)
         if view.path.touching >= SURFACE_NEIGHBOURS:
-            reasons.append("the points form a surface, not a rope: background passes the colour or the position box")
+            reasons.append(A_SURFACE)
         if self._ropes:
             view.strands = strands_of(view.path, points, frame, diameter, self.config.slicing.surface_offset)
             if view.strands:
@@ -420,10 +425,9 @@ class PersistentTracker:
 
 def _agrees(strand: Strand, rope: Expected) -> bool:
     """Whether a strand from end to end lies where the rope is expected, but for a tenth of it."""
-    places = np.linspace(0, rope.length, len(rope.nodes))
     at = strand.arc * (rope.length / strand.length)
-    there = np.stack([np.interp(at, places, rope.nodes[:, k]) for k in range(3)], axis=1)
-    off = np.linalg.norm(strand.nodes - there, axis=1) / np.interp(at, places, rope.sigma)
+    there = interpolated(at, rope.places, rope.nodes)
+    off = np.linalg.norm(strand.nodes - there, axis=1) / np.interp(at, rope.places, rope.sigma)
     return bool(np.percentile(off, 90) < _AGREES)
 
 

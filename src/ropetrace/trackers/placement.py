@@ -89,9 +89,14 @@ class Expected:
         """Between the nodes, metres."""
         return self.length / (len(self.nodes) - 1)
 
+    @property
+    def places(self) -> FloatArray:
+        """Of the nodes along the rope, (M,), metres."""
+        return np.linspace(0, self.length, len(self.nodes))
+
     def sigma_at(self, place: float) -> float:
         """How far the rope may be off at a place along it, metres."""
-        return float(np.interp(place, np.linspace(0, self.length, len(self.nodes)), self.sigma))
+        return float(np.interp(place, self.places, self.sigma))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,10 +8,9 @@ from __future__ import annotations
 from functools import reduce
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ropetrace.axis import axis_points
-from ropetrace.centerline import SHORTEST_STEP, chain_tangents, extend_to_tips, make_waypoints
+from ropetrace.centerline import chain_tangents, extend_to_tips, make_waypoints
 from ropetrace.config import RopeConfig, SegmentationConfig, parse_color
 from ropetrace.errors import FrameError
 from ropetrace.ordering import (
@@ -26,7 +25,7 @@ from ropetrace.segmentation import ColorGate, PositionBox, Segmenter
 from ropetrace.slicing import Slicer
 from ropetrace.trackers.base import Lap, Mask, no_lap
 from ropetrace.trackers.doubts import Doubts
-from ropetrace.trackers.strands import gaps_in_view, reach_of
+from ropetrace.trackers.strands import distinct, gaps_in_view, reach_of
 from ropetrace.types import (
     BadFrame,
     Cloud,
@@ -94,7 +93,7 @@ class SlicingTracker:
         if count == 0:
             return Estimate.lost(frame.stamp_ns, "no points of the rope's colour and place")
         if stride > 1:
-            reasons.append(f"{count} points passed, one in {stride} is used: narrow the colour or the position box")
+            reasons.append(thinned(count, stride))
         return self.estimate(frame.stamp_ns, points, count, stride, reasons, lap)
 
     def estimate(
@@ -116,16 +115,14 @@ class SlicingTracker:
         slices = self.slicer.slice(points)
         lap("slicing")
         if slices.capped:
-            reasons.append(
-                f"more than {self.slicer.max_nodes} slices: background is taken for rope, or the diameter is too small"
-            )
+            reasons.append(too_many(self.slicer.max_nodes))
         if len(slices) < 2:
             return Estimate.lost(stamp_ns, too_little(points.shape[1], len(slices)), count)
 
         slices, trouble = self._in_order(slices)
         reasons += trouble
         lap("ordering")
-        slices = slices.kept(_distinct(slices.centroids))
+        slices = slices.kept(distinct(slices.centroids))
         if len(slices) < 2:
             return Estimate.lost(stamp_ns, _scattered(points.shape[1]), count)
 
@@ -214,7 +211,7 @@ class SlicingTracker:
         if bridged > BRIDGE_DIAMETERS * self.config.diameter:
             trouble.append(f"a gap of {bridged * 1e3:.0f} mm is bridged")
         if surface:
-            trouble.append("the points form a surface, not a rope: background passes the colour or the position box")
+            trouble.append(A_SURFACE)
         slices = slices.kept(order)
         if len(slices) > 1 and self._runs_backwards(slices.centroids):
             slices = slices.kept(np.arange(len(slices))[::-1])
@@ -239,10 +236,17 @@ SURFACE_NEIGHBOURS = 4
 """Where the typical slice touches this many others, the points are a wall or a table, not a rope."""
 
 
-def _distinct(chain: FloatArray) -> NDArray[np.bool_]:
-    """Which nodes of a chain do not coincide with the one before."""
-    steps = np.diff(chain, axis=0)
-    return np.concatenate([[True], np.einsum("ij,ij->i", steps, steps) > SHORTEST_STEP**2])
+A_SURFACE = "the points form a surface, not a rope: background passes the colour or the position box"
+
+
+def thinned(count: int, stride: int) -> str:
+    """That of so many points every k-th was used."""
+    return f"{count} points passed, one in {stride} is used: narrow the colour or the position box"
+
+
+def too_many(most: int) -> str:
+    """That the cap on slices was met."""
+    return f"more than {most} slices: background is taken for rope, or the diameter is too small"
 
 
 def too_little(points: int, slices: int) -> str:

@@ -172,13 +172,18 @@ def path_through(slices: Slices, diameter: float) -> Path:
     graph = NodeGraph.of(slices.centroids, slices.covariances)
     order = order_path(graph)
     slices = slices.kept(order)
-    steps = np.diff(slices.centroids, axis=0)
-    keep = np.concatenate([[True], np.einsum("ij,ij->i", steps, steps) > SHORTEST_STEP**2])
+    keep = distinct(slices.centroids)
     if not keep.all():
         order, slices = order[keep], slices.kept(keep)
     unsure = np.zeros(len(slices), np.bool_)
     _mark_unsure(slices.centroids, arc_lengths(slices.centroids), diameter, unsure)
     return Path(slices, gaps_in_view(graph, order, slices.centroids), unsure, int(np.median(graph.touching)))
+
+
+def distinct(chain: FloatArray) -> NDArray[np.bool_]:
+    """Which nodes of a chain do not coincide with the one before."""
+    steps = np.diff(chain, axis=0)
+    return np.concatenate([[True], np.einsum("ij,ij->i", steps, steps) > SHORTEST_STEP**2])
 
 
 def gaps_in_view(graph: NodeGraph, order: NDArray[np.int64], centroids: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ropetrace.centerline import SHORTEST_STEP, spline_at
-from ropetrace.trackers.clouds import evenly_along
+from ropetrace.trackers.clouds import evenly_along, interpolated
 from ropetrace.trackers.hidden import fill_hidden
 from ropetrace.trackers.placement import SAME_LENGTH, Expected, Placed
 from ropetrace.trackers.sight import nearest_hidden
@@ -184,8 +184,8 @@ class WholeRope:
         first = self.nodes[0] + (self.nodes[0] - self.nodes[1]) * (_FARTHEST / self.spacing)
         last = self.nodes[-1] + (self.nodes[-1] - self.nodes[-2]) * (_FARTHEST / self.spacing)
         knots = np.array([-_FARTHEST, *places, self.length + _FARTHEST])
-        self.nodes = _at(anew, knots, np.array([first, *self.nodes, last]))
-        self.velocities = _at(anew, places, self.velocities)
+        self.nodes = interpolated(anew, knots, np.array([first, *self.nodes, last]))
+        self.velocities = interpolated(anew, places, self.velocities)
         self.unseen, self.adrift = (np.interp(anew, places, times) for times in (self.unseen, self.adrift))
         self.length = end - start
 
@@ -311,11 +311,6 @@ def _reach_on(rope: WholeRope, laid: list[Laid], diameter: float) -> None:
         rope.span(ends[0], ends[1])
         laid[:] = [one._replace(start=one.start - ends[0]) for one in laid]
     rope.tips = tips[0], tips[1]
-
-
-def _at(places: FloatArray, knots: FloatArray, rows: FloatArray) -> FloatArray:
-    """Rows, (K, 3), interpolated from their knots to other places, (P, 3)."""
-    return np.stack([np.interp(places, knots, rows[:, k]) for k in range(3)], axis=1)
 
 
 def _knots(laid: Laid) -> tuple[FloatArray, FloatArray]:
