@@ -25,7 +25,7 @@ from ropetrace.terminal import BAD_INPUT
 
 if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
-    from ropetrace.ros2.topics import RosNode
+    from ropetrace.ros.graph import RosNode
 
 RESTART_AFTER = 1.0
 """Seconds."""
@@ -53,8 +53,8 @@ class Reach:
 
     def node(self, name: str) -> RosNode:
         """Join the graph; says so if there is no router."""
-        from ropetrace.ros2.session import Connection, router_answers
-        from ropetrace.ros2.topics import RosNode
+        from ropetrace.ros.zenoh_graph import ZenohNode
+        from ropetrace.ros.zenoh_session import Connection, router_answers
 
         domain = self.domain if self.domain is not None else _domain_of_environment()
         connection = Connection(self.router, self.mode, self.listen, self.multicast, domain, self.humble)
@@ -65,7 +65,7 @@ class Reach:
                 file=sys.stderr,
                 flush=True,
             )
-        return RosNode(name, connection)
+        return ZenohNode(name, connection)
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ class TrackDeformable:
     reach: OmitArgPrefixes[Reach]
 
     def run(self) -> int:
-        from ropetrace.ros2 import track_deformable
-        from ropetrace.ros2.live_camera import CameraTopics
+        from ropetrace.ros import track_deformable
+        from ropetrace.ros.live_camera import CameraTopics
 
         images = self.images
         config = self.rope.settings()
@@ -122,7 +122,7 @@ class TrajectoryTracker:
     reach: OmitArgPrefixes[Reach]
 
     def run(self) -> int:
-        from ropetrace.ros2 import trajectory_tracker
+        from ropetrace.ros import trajectory_tracker
 
         config = self.rope.settings()
         return _run(self.reach, "trajectory_tracker", lambda node: trajectory_tracker.TrajectoryTracker(node, config))
@@ -140,7 +140,7 @@ class KinematicSystem:
     reach: OmitArgPrefixes[Reach]
 
     def run(self) -> int:
-        from ropetrace.ros2 import kinematic_system
+        from ropetrace.ros import kinematic_system
 
         config = self.rope.settings()
         _check_camera_pose(config)
@@ -160,7 +160,7 @@ class Sim:
     """Write the settings for the other nodes, for their --config."""
 
     def run(self) -> int:
-        from ropetrace.ros2.simulated_cell import CellSettings, SimulatedCell, cell_config
+        from ropetrace.ros.simulated_cell import CellSettings, SimulatedCell, cell_config
 
         if self.settings is not None:
             _write_settings(self.settings, cell_config())
@@ -175,7 +175,7 @@ class Router:
     """Where it listens."""
 
     def run(self) -> int:
-        from ropetrace.ros2.session import open_router
+        from ropetrace.ros.zenoh_session import open_router
 
         should_stop = _told_to_stop()
         with closing(open_router(self.router)):
@@ -200,12 +200,12 @@ class All:
         import_extra("zenoh", "ros2")
         for module, extra in (("pinocchio", "arm"), *([("mujoco", "sim")] if self.simulate else [])):
             import_extra(module, extra)
-        from ropetrace.ros2.session import router_answers
+        from ropetrace.ros.zenoh_session import router_answers
 
         with tempfile.TemporaryDirectory(prefix="ropetrace-") as folder:
             rope = _flags(self.rope)
             if self.simulate:
-                from ropetrace.ros2.simulated_cell import cell_config
+                from ropetrace.ros.simulated_cell import cell_config
 
                 settings = Path(folder) / "sim.toml"
                 _write_settings(settings, cell_config())

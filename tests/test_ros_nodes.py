@@ -24,17 +24,18 @@ from ropetrace.evaluation.metrics import symmetric_mean
 from ropetrace.recordings.ros_frames import CLOUD_TOPIC, COLOR_TOPIC, DEPTH_TOPIC, frame_messages
 from ropetrace.recordings.ros_messages import CLOUD, IMAGE, RawMessage, decoded, stamp_and_frame
 from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, header, make, path, trajectory, typestore
-from ropetrace.ros2 import messages
-from ropetrace.ros2.kinematic_system import ArmSettings, KinematicSystem
-from ropetrace.ros2.live_camera import CameraTopics
-from ropetrace.ros2.messages import JOINTS, NUMBERS, POSES
-from ropetrace.ros2.simulated_cell import cell_config
-from ropetrace.ros2.topics import Publisher, RosNode, Subscription
-from ropetrace.ros2.track_deformable import TrackDeformable
-from ropetrace.ros2.trajectory_tracker import TrajectoryTracker
+from ropetrace.ros import messages
+from ropetrace.ros.graph import Publisher, Subscription
+from ropetrace.ros.kinematic_system import ArmSettings, KinematicSystem
+from ropetrace.ros.live_camera import CameraTopics
+from ropetrace.ros.messages import JOINTS, NUMBERS, POSES
+from ropetrace.ros.simulated_cell import cell_config
+from ropetrace.ros.track_deformable import TrackDeformable
+from ropetrace.ros.trajectory_tracker import TrajectoryTracker
+from ropetrace.ros.zenoh_graph import ZenohNode
 from ropetrace.sim.scenario import SimulatedScene
 from ropetrace.types import CloudFrame, FloatArray, Frame, Motion, RgbdFrame, Waypoints
-from ros2_rig import routed, until
+from ros_rig import routed, until
 
 PANDA = Arm.named("panda")
 START = np.array(PLACEMENTS["behind"].start)
@@ -51,7 +52,7 @@ def scene() -> tuple[RgbdFrame, FloatArray]:
 class Sender:
     """A camera: sends frames with the stamps that they are given."""
 
-    def __init__(self, node: RosNode) -> None:
+    def __init__(self, node: ZenohNode) -> None:
         self._node = node
         self._publishers: dict[str, Publisher] = {}
 
@@ -79,9 +80,9 @@ def running(node: Any) -> Iterator[None]:
 
 
 @contextmanager
-def graph() -> Iterator[tuple[RosNode, RosNode]]:
+def graph() -> Iterator[tuple[ZenohNode, ZenohNode]]:
     """A node under test, and one beside it."""
-    with routed() as connection, RosNode("tested", connection) as tested, RosNode("beside", connection) as beside:
+    with routed() as connection, ZenohNode("tested", connection) as tested, ZenohNode("beside", connection) as beside:
         yield tested, beside
 
 
@@ -220,12 +221,12 @@ def test_a_camera_may_change_its_size(scene: tuple[RgbdFrame, FloatArray]) -> No
 
 
 def test_a_camera_that_vanishes_is_told_and_one_that_returns_is_tracked(scene: tuple[RgbdFrame, FloatArray]) -> None:
-    with routed() as connection, RosNode("tested", connection) as node, RosNode("reader", connection) as reader:
+    with routed() as connection, ZenohNode("tested", connection) as node, ZenohNode("reader", connection) as reader:
         heard = reader.subscription("/diagnostics", DIAGNOSTICS, depth=100)
         paths = reader.subscription("/ropetrace/centerline", PATH, depth=1000)
         with running(TrackDeformable(node, cell_config())):
             for _ in range(2):
-                with RosNode("camera", connection) as beside:
+                with ZenohNode("camera", connection) as beside:
                     camera = Sender(beside)
                     until(tracked(camera, scene[0], paths))
                 until(says(heard, f"nothing came on {DEPTH_TOPIC} for"))
@@ -295,7 +296,7 @@ def test_no_motion_is_no_trajectory_tracker() -> None:
 class ArmAndRope:
     """An arm that does exactly as it is told, and a rope at rest: both sent by `beside`."""
 
-    def __init__(self, beside: RosNode) -> None:
+    def __init__(self, beside: ZenohNode) -> None:
         self.position = START.copy()
         self._joints = beside.publisher("/joint_states", JOINTS)
         self._paths = beside.publisher("/ropetrace/centerline", PATH)

@@ -1,6 +1,6 @@
 """From a camera's images to the rope's path over live ROS 2: how long it takes, on this machine.
 
-    python benchmarks/ros2.py
+    python benchmarks/ros.py
 
 A camera of 480x360 at 30 frames a second, in this process, shows case study 2's rope in a wind of 0.8 Hz;
 track_deformable runs in a process of its own; a third session reads the paths. Latency is from a frame's stamp, which
@@ -23,9 +23,10 @@ from ropetrace.evaluation.case1 import CONDITIONS, Case1Settings, scenario
 from ropetrace.recordings.ros_frames import frame_messages
 from ropetrace.recordings.ros_messages import stamp_and_frame
 from ropetrace.results.ros_estimates import PATH
-from ropetrace.ros2.session import Connection, open_router
-from ropetrace.ros2.simulated_cell import cell_config
-from ropetrace.ros2.topics import Publisher, RosNode
+from ropetrace.ros.graph import Publisher
+from ropetrace.ros.simulated_cell import cell_config
+from ropetrace.ros.zenoh_graph import ZenohNode
+from ropetrace.ros.zenoh_session import Connection, open_router
 from ropetrace.sim.scenario import SimulatedScene
 from ropetrace.types import RgbdFrame
 
@@ -55,7 +56,7 @@ def main() -> None:
         command = [sys.executable, "-m", "ropetrace", "node", "track_deformable"]
         tracker = subprocess.Popen([*command, "--config", str(settings), "--router", ROUTER])
         try:
-            with RosNode("camera", connection) as camera, RosNode("reader", connection) as reader:
+            with ZenohNode("camera", connection) as camera, ZenohNode("reader", connection) as reader:
                 paths = reader.subscription("/ropetrace/centerline", PATH, depth=count + 1000)
                 publishers: dict[str, Publisher] = {}
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 from ropetrace.config import RopeConfig
 from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, estimate_status, header, path, pose_array, topic_of
-from ropetrace.ros2.live_camera import CameraTopics, LiveCamera, Seen
-from ropetrace.ros2.messages import POSES
-from ropetrace.ros2.reporting import Reporter
-from ropetrace.ros2.topics import Publisher, RosNode
+from ropetrace.ros.graph import Publisher, RosNode
+from ropetrace.ros.live_camera import CameraTopics, LiveCamera, Seen
+from ropetrace.ros.messages import POSES
+from ropetrace.ros.reporting import Reporter
 from ropetrace.trackers import make_tracker
 from ropetrace.tracking import estimates_of
 from ropetrace.types import Estimate, Status

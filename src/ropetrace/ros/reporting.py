@@ -7,7 +7,7 @@ import sys
 import time
 
 from ropetrace.results.ros_estimates import DIAGNOSTICS, diagnostics, header
-from ropetrace.ros2.topics import RosNode
+from ropetrace.ros.graph import RosNode
 from ropetrace.types import Status
 
 EVERY = 1.0

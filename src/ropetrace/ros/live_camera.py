@@ -11,7 +11,7 @@ from ropetrace.recordings import ros_messages
 from ropetrace.recordings.pairing import missing_color
 from ropetrace.recordings.ros_frames import COLOR_TOPIC, DEPTH_TOPIC
 from ropetrace.recordings.ros_messages import CAMERA, CLOUD, IMAGE, RawMessage
-from ropetrace.ros2.topics import RosNode, Subscription, check_topic
+from ropetrace.ros.graph import RosNode, Subscription, check_topic
 from ropetrace.types import BadFrame, CloudFrame, Event, Intrinsics, RgbdFrame
 
 MOST_APART_NS = 20_000_000

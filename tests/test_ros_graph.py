@@ -21,13 +21,14 @@ from ropetrace.cli_node import Images, Joints, Reach, Router
 from ropetrace.errors import ConfigError
 from ropetrace.recordings.ros_messages import RawMessage, decoded
 from ropetrace.results.ros_estimates import PATH, TRAJECTORY
-from ropetrace.ros2.kinematic_system import ArmSettings
-from ropetrace.ros2.live_camera import CameraTopics
-from ropetrace.ros2.messages import JOINTS, NUMBERS
-from ropetrace.ros2.session import Connection
-from ropetrace.ros2.simulated_cell import cell_config
-from ropetrace.ros2.topics import RosNode, Subscription
-from ros2_rig import free_endpoint, until
+from ropetrace.ros.graph import Subscription
+from ropetrace.ros.kinematic_system import ArmSettings
+from ropetrace.ros.live_camera import CameraTopics
+from ropetrace.ros.messages import JOINTS, NUMBERS
+from ropetrace.ros.simulated_cell import cell_config
+from ropetrace.ros.zenoh_graph import ZenohNode
+from ropetrace.ros.zenoh_session import Connection
+from ros_rig import free_endpoint, until
 
 STARTED = 60.0
 """A node with its kernels is up within this, seconds: the machine may be busy."""
@@ -88,7 +89,7 @@ def enough(read: Subscription) -> list[RawMessage]:
 
 
 def test_the_graph_traces_the_rope_and_outlives_each_of_its_nodes(graph: Graph) -> None:
-    with RosNode("watcher", Connection(router=graph.router)) as watcher:
+    with ZenohNode("watcher", Connection(router=graph.router)) as watcher:
         reads = {
             "path": watcher.subscription("/ropetrace/centerline", PATH, depth=1000),
             "motion": watcher.subscription("/ropetrace/motion", TRAJECTORY, depth=1000),

@@ -11,10 +11,10 @@ from ropetrace.errors import ConfigError, FrameError
 from ropetrace.motion import make_motion
 from ropetrace.recordings.ros_messages import RawMessage, stamp_and_frame
 from ropetrace.results.ros_estimates import PATH, TRAJECTORY, header, path, topic_of, trajectory
-from ropetrace.ros2 import messages
-from ropetrace.ros2.reporting import Reporter
-from ropetrace.ros2.topics import RosNode
-from ropetrace.ros2.track_deformable import SILENCE, from_the_future
+from ropetrace.ros import messages
+from ropetrace.ros.graph import RosNode
+from ropetrace.ros.reporting import Reporter
+from ropetrace.ros.track_deformable import SILENCE, from_the_future
 from ropetrace.types import Status
 
 LONGEST_PREDICTION = 0.5

@@ -11,33 +11,17 @@ import re
 import struct
 import threading
 import time
-from collections import deque
 from functools import cache
 from typing import Any, Literal
 
-from ropetrace.errors import ConfigError, import_extra
-from ropetrace.recordings.ros_messages import MAX_MESSAGE_BYTES, RawMessage
+from ropetrace.errors import import_extra
 from ropetrace.results.ros_estimates import typestore
-from ropetrace.ros2.session import Connection, open_session
+from ropetrace.ros.graph import Subscription, check_topic
+from ropetrace.ros.zenoh_session import Connection, open_session
 
 ADMIN_SPACE = "@ros2_lv"
 NO_HASH = "TypeHashNotSupported"
 """What Humble has in the place of a type's hash."""
-
-_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
-
-
-def check_topic(name: str) -> str:
-    """The name of a topic, if it can be one.
-
-    Raises
-    ------
-    ConfigError
-        If it is not a full name such as /camera/depth/image_raw.
-    """
-    if not _TOPIC.fullmatch(name):
-        raise ConfigError(f"{name!r} is no full name of a topic: expected one such as /camera/depth/image_raw")
-    return name
 
 
 def dds_type(name: str) -> str:
@@ -106,8 +90,8 @@ def attachment(sequence: int, source_ns: int, gid: bytes) -> bytes:
     return struct.pack("<qqB16s", sequence, source_ns, 16, gid)
 
 
-class Publisher:
-    """Sends messages of one type; never waits for who reads them. Made by `RosNode.publisher`."""
+class ZenohPublisher:
+    """A `graph.Publisher`; made by `ZenohNode.publisher`."""
 
     def __init__(self, publisher: Any, name: str, type_name: str) -> None:
         self._publisher = publisher
@@ -125,62 +109,8 @@ class Publisher:
         self._publisher.put(data, attachment=attachment(self._sequence, time.time_ns(), self._gid))
 
 
-class Subscription:
-    """The last messages of a topic. Made by `RosNode.subscription`.
-
-    Attributes
-    ----------
-    topic, type : str
-        What is read.
-    """
-
-    def __init__(self, topic: str, type_name: str, depth: int, arrived: threading.Event) -> None:
-        self.topic = topic
-        self.type = type_name
-        self._messages: deque[RawMessage] = deque(maxlen=depth)
-        self._arrived = arrived
-        self._others: dict[str, str] = {}
-
-    def take(self) -> list[RawMessage]:
-        """The messages since the last call, oldest first; ``log_time_ns`` is when each came."""
-        taken = []
-        while self._messages:
-            taken.append(self._messages.popleft())
-        return taken
-
-    def newest(self) -> RawMessage | None:
-        """The last message since the last call."""
-        taken = self.take()
-        return taken[-1] if taken else None
-
-    def problem(self) -> str:
-        """Who publishes something else under this name, in words; empty if nobody does."""
-        return "; ".join(list(self._others.values()))
-
-    def _receive(self, sample: Any) -> None:
-        if len(sample.payload) <= MAX_MESSAGE_BYTES:
-            data = sample.payload.to_bytes()
-            self._messages.append(RawMessage(self.topic, self.type, "cdr", time.time_ns(), data))
-            self._arrived.set()
-
-    def _meet(self, sample: Any, humble: bool) -> None:
-        """A publisher of this topic came or went."""
-        token = str(sample.key_expr)
-        parts = token.split("/")
-        node, found, found_hash = parts[8], ros_type(parts[10]), parts[11]
-        if str(sample.kind).endswith("DELETE"):
-            self._others.pop(token, None)
-        elif found != self.type:
-            self._others[token] = f"{self.topic} of node {node} is {found}, expected {self.type}: not read"
-        elif found_hash != type_hash(self.type, humble):
-            hint = "; Humble needs --humble" if found_hash == NO_HASH else ""
-            self._others[token] = (
-                f"{self.topic} of node {node} has another definition of {found} ({found_hash[:15]}...): not read{hint}"
-            )
-
-
-class RosNode:
-    """A node of the ROS graph; a context manager.
+class ZenohNode:
+    """A node of a ROS 2 graph over Zenoh: a `graph.RosNode`.
 
     Parameters
     ----------
@@ -209,7 +139,7 @@ class RosNode:
         token = node_token(self.connection.domain, self._session_id, name)
         self._held.append(self._session.liveliness().declare_token(token))
 
-    def __enter__(self) -> RosNode:
+    def __enter__(self) -> ZenohNode:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -223,7 +153,7 @@ class RosNode:
         """Whether a router is connected."""
         return bool(self._session.info.routers_zid())
 
-    def publisher(self, topic: str, type_name: str, depth: int = 5) -> Publisher:
+    def publisher(self, topic: str, type_name: str, depth: int = 5) -> ZenohPublisher:
         """Publish messages of a type.
 
         Raises
@@ -241,7 +171,7 @@ class RosNode:
         )
         name = self._token("MP", topic, type_name, depth)
         self._held += [declared, self._session.liveliness().declare_token(name)]
-        return Publisher(declared, name, type_name)
+        return ZenohPublisher(declared, name, type_name)
 
     def subscription(self, topic: str, type_name: str, depth: int = 1) -> Subscription:
         """Read a topic: the last `depth` messages are kept.
@@ -256,9 +186,12 @@ class RosNode:
         publishers = f"{ADMIN_SPACE}/{domain}/*/*/*/MP/*/*/*/{topic.replace('/', '%')}/*/*/*"
         liveliness = self._session.liveliness()
         self._held += [
-            self._session.declare_subscriber(topic_key(domain, topic, type_name, humble), read._receive),
+            self._session.declare_subscriber(
+                topic_key(domain, topic, type_name, humble),
+                lambda sample: read.receive(sample.payload.to_bytes(), "cdr"),
+            ),
             liveliness.declare_token(self._token("MS", topic, type_name, depth)),
-            liveliness.declare_subscriber(publishers, lambda sample: read._meet(sample, humble), history=True),
+            liveliness.declare_subscriber(publishers, lambda sample: _meet(read, sample, humble), history=True),
         ]
         return read
 
@@ -280,4 +213,20 @@ class RosNode:
             type_name,
             depth,
             connection.humble,
+        )
+
+
+def _meet(read: Subscription, sample: Any, humble: bool) -> None:
+    """A publisher of this topic came or went."""
+    token = str(sample.key_expr)
+    parts = token.split("/")
+    node, found, found_hash = parts[8], ros_type(parts[10]), parts[11]
+    if str(sample.kind).endswith("DELETE"):
+        read.others.pop(token, None)
+    elif found != read.type:
+        read.others[token] = f"{read.topic} of node {node} is {found}, expected {read.type}: not read"
+    elif found_hash != type_hash(read.type, humble):
+        hint = "; Humble needs --humble" if found_hash == NO_HASH else ""
+        read.others[token] = (
+            f"{read.topic} of node {node} has another definition of {found} ({found_hash[:15]}...): not read{hint}"
         )

@@ -23,12 +23,11 @@ from rosbags.typesys import Stores, get_typestore
 from ropetrace.errors import ConfigError, RosError
 from ropetrace.recordings.ros_messages import CAMERA, CLOUD, IMAGE
 from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, make
-from ropetrace.ros2 import messages
-from ropetrace.ros2.session import Connection, open_session
-from ropetrace.ros2.topics import (
-    RosNode,
+from ropetrace.ros import messages
+from ropetrace.ros.graph import check_topic
+from ropetrace.ros.zenoh_graph import (
+    ZenohNode,
     attachment,
-    check_topic,
     dds_type,
     node_token,
     ros_type,
@@ -36,7 +35,8 @@ from ropetrace.ros2.topics import (
     topic_token,
     type_hash,
 )
-from ros2_rig import free_endpoint, routed, until
+from ropetrace.ros.zenoh_session import Connection, open_session
+from ros_rig import free_endpoint, routed, until
 
 STRING = "std_msgs/msg/String"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -114,7 +114,7 @@ def test_a_raw_peer_sees_the_node_its_topics_and_its_messages(humble: bool) -> N
                 "@ros2_lv/**", lambda s: tokens.append((str(s.kind).rpartition(".")[2], str(s.key_expr))), history=True
             ),
         ]
-        node = RosNode("talker", connection)
+        node = ZenohNode("talker", connection)
         publisher = node.publisher("/chatter", STRING)
         node.subscription("/camera/depth", IMAGE)
         until(lambda: len(tokens) == 3)
@@ -149,7 +149,7 @@ def test_a_raw_peer_sees_the_node_its_topics_and_its_messages(humble: bool) -> N
 
 @pytest.mark.parametrize("mode", ["peer", "client"])
 def test_messages_arrive_and_only_the_last_are_kept(mode: Any) -> None:
-    with routed() as base, RosNode("a", replace(base, mode=mode)) as one, RosNode("b", base) as two:
+    with routed() as base, ZenohNode("a", replace(base, mode=mode)) as one, ZenohNode("b", base) as two:
         publisher, read = one.publisher("/text", STRING), two.subscription("/text", STRING, depth=2)
 
         def sent() -> bool:
@@ -164,7 +164,7 @@ def test_messages_arrive_and_only_the_last_are_kept(mode: Any) -> None:
 
 
 def test_a_topic_of_another_type_is_refused_with_words() -> None:
-    with routed() as connection, RosNode("camera", connection) as camera, RosNode("reader", connection) as reader:
+    with routed() as connection, ZenohNode("camera", connection) as camera, ZenohNode("reader", connection) as reader:
         read = reader.subscription("/camera/depth", IMAGE)
         assert read.problem() == ""
         wrong = camera.publisher("/camera/depth", STRING)
@@ -182,7 +182,7 @@ def test_a_topic_of_another_type_is_refused_with_words() -> None:
 def test_a_node_of_humble_is_told_from_one_of_jazzy() -> None:
     with routed() as connection:
         old = Connection(router=connection.router, humble=True)
-        with RosNode("camera", old) as camera, RosNode("reader", connection) as reader:
+        with ZenohNode("camera", old) as camera, ZenohNode("reader", connection) as reader:
             read = reader.subscription("/text", STRING)
             camera.publisher("/text", STRING)
             until(read.problem)
@@ -192,9 +192,9 @@ def test_a_node_of_humble_is_told_from_one_of_jazzy() -> None:
 
 STOPPED_READER = """
 import sys, time
-from ropetrace.ros2.session import Connection
-from ropetrace.ros2.topics import RosNode
-node = RosNode("stopped", Connection(router=sys.argv[1]))
+from ropetrace.ros.zenoh_session import Connection
+from ropetrace.ros.zenoh_graph import ZenohNode
+node = ZenohNode("stopped", Connection(router=sys.argv[1]))
 read = node.subscription("/camera/depth", "sensor_msgs/msg/Image")
 while not read.take():
     node.wait(0.1)
@@ -204,7 +204,7 @@ time.sleep(600)
 
 
 def test_a_reader_that_hangs_does_not_hold_up_the_publisher() -> None:
-    with routed() as connection, RosNode("camera", connection) as camera:
+    with routed() as connection, ZenohNode("camera", connection) as camera:
         publisher = camera.publisher("/camera/depth", IMAGE)
         reader = subprocess.Popen(
             [sys.executable, "-c", STOPPED_READER, connection.router], stdout=subprocess.PIPE, text=True
@@ -239,9 +239,9 @@ def test_nothing_listens_beyond_loopback(mode: Any) -> None:
     with routed() as base:
         script = (
             "import sys, time\n"
-            "from ropetrace.ros2.session import Connection\n"
-            "from ropetrace.ros2.topics import RosNode\n"
-            "node = RosNode('quiet', Connection(router=sys.argv[1], mode=sys.argv[2]))\n"
+            "from ropetrace.ros.zenoh_session import Connection\n"
+            "from ropetrace.ros.zenoh_graph import ZenohNode\n"
+            "node = ZenohNode('quiet', Connection(router=sys.argv[1], mode=sys.argv[2]))\n"
             "node.publisher('/text', 'std_msgs/msg/String')\n"
             "node.subscription('/other', 'std_msgs/msg/String')\n"
             "print('up', flush=True)\n"

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from ropetrace.ros2.session import Connection, open_router
+from ropetrace.ros.zenoh_session import Connection, open_router
 
 
 def free_endpoint() -> str:

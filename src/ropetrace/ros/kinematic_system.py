@@ -16,10 +16,10 @@ from ropetrace.control.tracing import Phase, TracingSettings
 from ropetrace.errors import ConfigError, FrameError
 from ropetrace.recordings.ros_messages import stamp_and_frame
 from ropetrace.results.ros_estimates import PATH, TRAJECTORY, header, topic_of
-from ropetrace.ros2 import messages
-from ropetrace.ros2.messages import JOINTS, NUMBERS
-from ropetrace.ros2.reporting import Reporter
-from ropetrace.ros2.topics import RosNode, check_topic
+from ropetrace.ros import messages
+from ropetrace.ros.graph import RosNode, check_topic
+from ropetrace.ros.messages import JOINTS, NUMBERS
+from ropetrace.ros.reporting import Reporter
 from ropetrace.types import Estimate, FloatArray, Motion, Status, Waypoints
 
 MARGIN = 0.01

@@ -16,10 +16,10 @@ from ropetrace.evaluation.case1 import CONDITIONS, Case1Settings, rope_config, s
 from ropetrace.evaluation.case2 import CONTROL_RATE, PLACEMENTS
 from ropetrace.recordings.ros_frames import frame_messages
 from ropetrace.results.ros_estimates import header, topic_of
-from ropetrace.ros2 import messages
-from ropetrace.ros2.messages import JOINTS
-from ropetrace.ros2.reporting import Reporter
-from ropetrace.ros2.topics import Publisher, RosNode
+from ropetrace.ros import messages
+from ropetrace.ros.graph import Publisher, RosNode
+from ropetrace.ros.messages import JOINTS
+from ropetrace.ros.reporting import Reporter
 from ropetrace.sim.arm import ArmSimulation
 from ropetrace.sim.scenario import CameraSettings, SimulatedScene
 from ropetrace.sim.scene import inverse_pose
