@@ -21,20 +21,23 @@ from ropetrace.errors import ConfigError, FrameError
 from ropetrace.evaluation.case1 import CONDITIONS, Case1Settings, scenario
 from ropetrace.evaluation.case2 import PLACEMENTS
 from ropetrace.evaluation.metrics import symmetric_mean
+from ropetrace.motion import make_motion
 from ropetrace.recordings.ros_frames import CLOUD_TOPIC, COLOR_TOPIC, DEPTH_TOPIC, frame_messages
 from ropetrace.recordings.ros_messages import CLOUD, IMAGE, RawMessage, decoded, stamp_and_frame
 from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, header, make, path, trajectory, typestore
 from ropetrace.ros import messages
 from ropetrace.ros.graph import Publisher, Subscription
-from ropetrace.ros.kinematic_system import ArmSettings, KinematicSystem
+from ropetrace.ros.kinematic_system import ArmSettings, KinematicSystem, ReceivedMotion, position_at
 from ropetrace.ros.live_camera import CameraTopics
-from ropetrace.ros.messages import JOINTS, NUMBERS, POSES
-from ropetrace.ros.simulated_cell import cell_config
+from ropetrace.ros.messages import JOINTS, NUMBERS, POSES, TIME
+from ropetrace.ros.robot_filter import RobotFilter
+from ropetrace.ros.simulated_cell import ARM_AWAY, CellSettings, SimulatedCell, cell_config
 from ropetrace.ros.track_deformable import TrackDeformable
 from ropetrace.ros.trajectory_tracker import TrajectoryTracker
 from ropetrace.ros.zenoh_graph import ZenohNode
-from ropetrace.sim.scenario import SimulatedScene
-from ropetrace.types import CloudFrame, FloatArray, Frame, Motion, RgbdFrame, Waypoints
+from ropetrace.sim.scenario import CLUTTER, ROBOT_COLOR, SimulatedScene
+from ropetrace.sim.scene import Capsules
+from ropetrace.types import BadFrame, CloudFrame, FloatArray, Frame, Motion, RgbdFrame, Waypoints, moved
 from ros_rig import routed, until
 
 PANDA = Arm.named("panda")
@@ -386,7 +389,128 @@ def test_a_joint_that_is_missing_is_told() -> None:
         messages.joint_values(message, ("a",), "velocity")
 
 
-@pytest.mark.parametrize("wrong", [{"rate": 0.5}, {"rate": float("nan")}, {"joint_topic": "joints"}])
+@pytest.mark.parametrize(
+    "wrong", [{"rate": 0.5}, {"rate": float("nan")}, {"response": 0.2}, {"response": -1.0}, {"joint_topic": "joints"}]
+)
 def test_an_arm_that_cannot_be(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         ArmSettings(**wrong)
+
+
+def test_predictions_are_those_of_the_motion_that_was_sent() -> None:
+    own, received = make_motion("arc_length", 0.015), ReceivedMotion()
+    assert own is not None
+    arcs = np.linspace(0.0, 0.6, 40)
+    motion = None
+    for frame in range(12):
+        time_s = frame / 30
+        places = np.stack([0.1 * arcs * np.sin(5 * time_s), arcs, np.ones(40)], axis=1)
+        rope = Waypoints(places, np.tile([0.0, 0.0, 0.0, 1.0], (40, 1)), arcs)
+        motion = own.update(round(time_s * 1e9), rope)
+    assert motion is not None
+    received.announce(motion)
+    received.update(round(time_s * 1e9), rope)
+    for ahead in (0.0, 0.004, 0.03):
+        ours, theirs = received.predict(ahead), own.predict(ahead)
+        assert ours is not None
+        assert theirs is not None
+        np.testing.assert_allclose(ours[0], theirs[0], atol=1e-9)
+        np.testing.assert_allclose(ours[1].velocities, theirs[1].velocities, atol=1e-9)
+        np.testing.assert_allclose(ours[1].accelerations, theirs[1].accelerations, atol=1e-9)
+
+
+def test_each_command_names_the_image_that_it_rests_on() -> None:
+    with graph() as (node, beside):
+        cell = ArmAndRope(beside)
+        commands = beside.subscription("/ropetrace/joint_commands", JOINTS, depth=10_000)
+        basis = beside.subscription("/ropetrace/command_basis", TIME, depth=10_000)
+        system = KinematicSystem(node, cell_config().world_from_camera(), ArmSettings(rate=50))
+        until(lambda: np.abs(getattr(drive(system, cell, 0.3), "velocity", 0.0)).max() > 0.01)
+        stamps = {stamp_and_frame(message)[0] for message in commands.take()}
+        seen = [decoded(message) for message in basis.take()]
+        assert len(seen) > 3
+        for told in seen:
+            command_ns = told.header.stamp.sec * 10**9 + told.header.stamp.nanosec
+            assert command_ns in stamps
+            assert 0 <= command_ns - (told.time_ref.sec * 10**9 + told.time_ref.nanosec) < 0.3e9
+
+
+@pytest.mark.parametrize(
+    ("age", "velocity", "carried"), [(0.02, 0.5, 0.01), (0.02, None, 0), (5, 0.5, 0), (-5, 0.5, 0)]
+)
+def test_joints_are_carried_on_from_their_stamp(age: float, velocity: float | None, carried: float) -> None:
+    """A message 20 ms old that says 0.5 rad/s is 10 mrad behind the arm; one of another time says nothing."""
+    now = 1e9
+    moving = None if velocity is None else np.full(7, velocity)
+    state = messages.joint_state(header(round((now - age) * 1e9), ""), PANDA.joint_names, START, moving)
+    message = RawMessage("/joint_states", JOINTS, "cdr", 0, bytes(typestore().serialize_cdr(state, JOINTS)))
+    np.testing.assert_allclose(position_at(now, message, PANDA.joint_names) - START, carried, atol=1e-6)
+
+
+def test_the_arm_is_taken_out_of_the_image() -> None:
+    """Joints of the image's time do it, those of another do not, and that is told."""
+    moving = SimulatedScene(scenario(CONDITIONS[0], 0.0, Case1Settings()))
+    placement = PLACEMENTS["behind"]
+    starts, ends, radii = PANDA.capsules(START)
+    pose = placement.world_from_base()
+    moving.robot = Capsules.between(moved(starts, pose), moved(ends, pose), radii, ROBOT_COLOR, CLUTTER)
+    frame = moving.camera.expose(moving.scene_at, moving.camera.stamp(1), 1)
+    moving.robot = Capsules.none()
+    without = moving.camera.expose(moving.scene_at, moving.camera.stamp(1), 1)
+    seen = frame.depth != without.depth
+    assert seen.sum() > 500
+    with graph() as (node, beside):
+        robot = RobotFilter(node, PANDA, "/joint_states", cell_config().world_from_camera())
+        joints = beside.publisher("/joint_states", JOINTS)
+        assert robot.clear(frame) is frame
+        assert "nothing on /joint_states is of its time" in robot.fault
+
+        def sent(ahead: float, offset: float) -> None:
+            held = header(frame.stamp_ns + round(ahead * 1e9), "")
+            joints.put(messages.joint_state(held, PANDA.joint_names, START + offset, None))
+
+        def cleared() -> bool:
+            sent(-0.01, -0.3)
+            sent(0.03, 0.9)
+            time.sleep(0.02)
+            made = robot.clear(frame)
+            assert isinstance(made, RgbdFrame)
+            return robot.fault == "" and not made.depth[seen].any()
+
+        until(cleared)
+        assert robot.clear(BadFrame(frame.stamp_ns, "bad")) == BadFrame(frame.stamp_ns, "bad")
+        late = replace(frame, stamp_ns=frame.stamp_ns + 10**9)
+        assert robot.clear(late) is late
+
+
+def test_an_arm_that_is_put_back_says_nothing_and_stands_still() -> None:
+    with graph() as (node, beside):
+        cell = SimulatedCell(node, CellSettings(condition="60fps"))
+        joints = beside.subscription("/joint_states", JOINTS, depth=10_000)
+        images = beside.subscription(DEPTH_TOPIC, IMAGE, depth=1000)
+        commands = beside.publisher("/ropetrace/joint_commands", JOINTS)
+        heard: list[tuple[float, bool]] = []
+
+        def tick(now: float) -> None:
+            fast = messages.joint_state(header(time.time_ns(), ""), PANDA.joint_names, None, np.full(7, 0.1))
+            commands.put(fast)
+            heard.append((now, bool(joints.take())))
+            if abs(now - ARM_AWAY - 0.5) < 1e-6:
+                assert np.abs(cell.moving.position - START).max() > 0.001
+                cell.put_back()
+            if ARM_AWAY + 0.6 < now < 2 * ARM_AWAY + 0.4:
+                assert np.abs(cell.moving.position - START).max() < 1e-6
+            if now < ARM_AWAY - 0.1:
+                assert np.abs(cell.moving.position - START).max() < 1e-6
+
+        end = time.monotonic() + 2 * ARM_AWAY + 1.5
+        cell.run(lambda: time.monotonic() > end, tick)
+        first = [now for now, any_ in heard if any_]
+        assert any(ARM_AWAY <= now < ARM_AWAY + 0.5 for now in first)
+        assert not any(ARM_AWAY + 0.7 < now < 2 * ARM_AWAY + 0.4 for now in first)
+        assert decoded(images.take()[-1]).width == 1280
+
+
+def test_a_cell_that_cannot_be() -> None:
+    with pytest.raises(ConfigError, match="condition = '45fps': choose of 30fps, 60fps"):
+        CellSettings(condition="45fps")

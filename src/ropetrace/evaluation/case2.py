@@ -319,22 +319,25 @@ class ClosedLoop:
 
     def tool_errors(self) -> ToolErrors:
         """How far the tool is from the rope now."""
-        truth = self.simulated.truth()
-        tool = inverse_pose(self.simulated.world_from_camera) @ self.moving.world_from_tool()
-        turn = tool[:3, :3]
-        if self.settings.tracing.approach == "from_camera":
-            turn = turn @ np.diag([1.0, -1.0, -1.0])
-        place = tool[None, :3, 3]
-        quaternion = Rotation.from_matrix(turn).as_quat()[None]
-        landed = projections(place, truth.polyline)
-        link = int(landed.segments[0])
-        lengths = np.linalg.norm(np.diff(truth.polyline, axis=0), axis=1)
-        return ToolErrors(
-            float(linear_errors(place, truth.polyline)[0]),
-            float(angular_errors(place, quaternion, truth.polyline, truth.link_quaternions)[0]),
-            float((lengths[:link].sum() + landed.fractions[0] * lengths[link]) / lengths.sum()),
-            truth.visible_fraction,
-        )
+        return tool_errors(self.simulated, self.moving, turned=self.settings.tracing.approach == "from_camera")
+
+
+def tool_errors(simulated: SimulatedScene, moving: ArmSimulation, turned: bool = False) -> ToolErrors:
+    """How far an arm's tool is from the rope now; `turned` is a tool that points away from the camera."""
+    truth = simulated.truth()
+    tool = inverse_pose(simulated.world_from_camera) @ moving.world_from_tool()
+    turn = tool[:3, :3] @ np.diag([1.0, -1.0, -1.0]) if turned else tool[:3, :3]
+    place = tool[None, :3, 3]
+    quaternion = Rotation.from_matrix(turn).as_quat()[None]
+    landed = projections(place, truth.polyline)
+    link = int(landed.segments[0])
+    lengths = np.linalg.norm(np.diff(truth.polyline, axis=0), axis=1)
+    return ToolErrors(
+        float(linear_errors(place, truth.polyline)[0]),
+        float(angular_errors(place, quaternion, truth.polyline, truth.link_quaternions)[0]),
+        float((lengths[:link].sum() + landed.fractions[0] * lengths[link]) / lengths.sum()),
+        truth.visible_fraction,
+    )
 
 
 def run_tracing(

@@ -14,11 +14,12 @@ from ropetrace.control.controller import TracingController
 from ropetrace.control.limits import Command, GuardOptions, ToolLimits
 from ropetrace.control.tracing import Phase, TracingSettings
 from ropetrace.errors import ConfigError, FrameError
-from ropetrace.recordings.ros_messages import stamp_and_frame
+from ropetrace.motion.filters import transition
+from ropetrace.recordings.ros_messages import RawMessage, stamp_and_frame
 from ropetrace.results.ros_estimates import PATH, TRAJECTORY, header, topic_of
 from ropetrace.ros import messages
 from ropetrace.ros.graph import RosNode, check_topic
-from ropetrace.ros.messages import JOINTS, NUMBERS
+from ropetrace.ros.messages import JOINTS, NUMBERS, TIME
 from ropetrace.ros.reporting import Reporter
 from ropetrace.types import Estimate, FloatArray, Motion, Status, Waypoints
 
@@ -30,6 +31,9 @@ JOINTS_FRESH = 0.1
 
 ARM_GONE = 1.0
 """An arm that has said nothing for this long is gone, seconds; when it is back, all begins from where it stands."""
+
+LONGEST_RESPONSE = 0.05
+"""Of an arm, seconds."""
 
 LONGEST_BRAKING = 2.0
 """For which a node that is told to stop goes on until the arm is at rest, seconds."""
@@ -49,6 +53,10 @@ class ArmSettings:
     """One that comes with ropetrace: panda or fr3."""
     rate: float = 100.0
     """Commands in a second."""
+    response: float = 0.0
+    """From a command's arrival until the joints move at its velocity, seconds."""
+    tool_turn: float = 2.5
+    """Greatest angular speed of the tool, rad/s; 2.5 is Franka's for its Cartesian interfaces."""
     joint_topic: str = "/joint_states"
     """sensor_msgs/JointState of the arm."""
     command_topic: str = "/ropetrace/velocity_commands"
@@ -57,12 +65,14 @@ class ArmSettings:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and 1 <= self.rate <= 1000):
             raise ConfigError(f"rate = {self.rate} Hz: expected 1 to 1000")
+        if not 0 <= self.response <= LONGEST_RESPONSE:
+            raise ConfigError(f"response = {self.response} s: expected 0 to {LONGEST_RESPONSE:g}")
         for name in (self.joint_topic, self.command_topic):
             check_topic(name)
 
 
 class ReceivedMotion:
-    """A `motion.MotionEstimator` that is told the motion: predictions go on from it at constant acceleration."""
+    """A `motion.MotionEstimator` that is told the motion: predictions go on from it as `motion.filters` do."""
 
     def __init__(self) -> None:
         self._known: tuple[int, Waypoints, Motion] | None = None
@@ -88,11 +98,12 @@ class ReceivedMotion:
         if self._known is None:
             return None
         _, waypoints, motion = self._known
-        velocities = motion.velocities + ahead * motion.accelerations
+        f01, f02, f12, f22 = transition(ahead)
+        velocities = motion.velocities + f12 * motion.accelerations
         unknown = np.full(velocities.shape, np.nan)
         return (
-            waypoints.positions + ahead * motion.velocities + 0.5 * ahead**2 * motion.accelerations,
-            Motion(velocities, motion.accelerations, unknown, unknown, unknown),
+            waypoints.positions + f01 * motion.velocities + f02 * motion.accelerations,
+            Motion(velocities, f22 * motion.accelerations, unknown, unknown, unknown),
         )
 
     def reset(self) -> None:
@@ -104,9 +115,10 @@ class KinematicSystem:
     """Lets an arm trace the first rope; it reads ``centerline``, to know when the rope is lost, and ``motion``.
 
     The commands are two messages: the velocities alone, as ros2_control takes them, and ``joint_commands``, a
-    JointState with names and a stamp. Nothing is sent before the arm's joints are known. Where the rope, its motion or
-    the joints' positions are missing or too old, the arm brakes, as `control.controller` has it. After an arm that was
-    gone for `ARM_GONE` has come back, the tracing begins anew.
+    JointState with names and a stamp. Beside them ``command_basis`` has the stamp of the newest image behind each.
+    Nothing is sent before the arm's joints are known. Where the rope, its motion or the joints' positions are missing
+    or too old, the arm brakes, as `control.controller` has it. After an arm that was gone for `ARM_GONE` has come back,
+    the tracing begins anew.
 
     Parameters
     ----------
@@ -117,7 +129,7 @@ class KinematicSystem:
     settings : ArmSettings
         Of the arm.
     tracing : TracingSettings, optional
-        Of the tracer; by default with a lead of half a period.
+        Of the tracer; by default with a lead of half a period and the arm's response.
 
     Raises
     ------
@@ -138,13 +150,14 @@ class KinematicSystem:
         self.period = 1 / self.settings.rate
         self._arm = Arm.named(self.settings.arm)
         self._base_from_camera = base_from_camera
-        self._tracing = tracing or TracingSettings(lead=self.period / 2)
+        self._tracing = tracing or TracingSettings(lead=self.period / 2 + self.settings.response)
         self._motion = ReceivedMotion()
         self._paths = node.subscription(topic_of(0, "centerline"), PATH, depth=10)
         self._moving = node.subscription(topic_of(0, "motion"), TRAJECTORY)
         self._joints = node.subscription(self.settings.joint_topic, JOINTS)
         self._velocities = node.publisher(self.settings.command_topic, NUMBERS)
         self._commands = node.publisher(topic_of(0, "joint_commands"), JOINTS)
+        self._basis = node.publisher(topic_of(0, "command_basis"), TIME)
         self._reporter = Reporter(node)
         self._controller: TracingController | None = None
         self._position: FloatArray | None = None
@@ -196,7 +209,7 @@ class KinematicSystem:
                 self.period,
                 self._tracing,
                 GuardOptions(margin=MARGIN),
-                ToolLimits(period=self.period),
+                ToolLimits(angular=self.settings.tool_turn, period=self.period),
             )
             # Making it may have taken longer than the guard lets pass between two steps.
             return None
@@ -228,7 +241,7 @@ class KinematicSystem:
         if message is None:
             return
         try:
-            self._position = messages.joint_values(message, self._arm.joint_names, "position")
+            self._position = position_at(now, message, self._arm.joint_names)
         except FrameError as error:
             self._fault = str(error)
         else:
@@ -256,3 +269,20 @@ class KinematicSystem:
         self._velocities.put(messages.numbers(command.velocity))
         held = header(round(now * 1e9), "")
         self._commands.put(messages.joint_state(held, self._arm.joint_names, None, command.velocity))
+        if self._motion.stamp_ns is not None:
+            self._basis.put(messages.time_reference(held, self._motion.stamp_ns))
+
+
+def position_at(now: float, message: RawMessage, names: tuple[str, ...]) -> FloatArray:
+    """Where the joints of a JointState are by now, if they went on as they did; just its positions if it is untimely.
+
+    Raises
+    ------
+    FrameError
+        If a joint is missing, or a position or a velocity is not finite.
+    """
+    position = messages.joint_values(message, names, "position")
+    age = now - stamp_and_frame(message)[0] / 1e9
+    if not 0 < age < JOINTS_FRESH or not messages.has_velocities(message):
+        return position
+    return position + age * messages.joint_values(message, names, "velocity")

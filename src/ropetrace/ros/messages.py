@@ -8,12 +8,13 @@ import numpy as np
 
 from ropetrace.errors import FrameError
 from ropetrace.recordings.ros_messages import RawMessage, decoded
-from ropetrace.results.ros_estimates import make
+from ropetrace.results.ros_estimates import NANOSECONDS, make
 from ropetrace.types import FloatArray, Motion, Waypoints
 
 POSES = "geometry_msgs/msg/PoseArray"
 JOINTS = "sensor_msgs/msg/JointState"
 NUMBERS = "std_msgs/msg/Float64MultiArray"
+TIME = "sensor_msgs/msg/TimeReference"
 
 MOST_WAYPOINTS = 100_000
 """That are taken from a message: a rope of a kilometre."""
@@ -35,6 +36,12 @@ def joint_state(held: Any, names: tuple[str, ...], position: FloatArray | None, 
 def numbers(values: FloatArray) -> Any:
     """A std_msgs/Float64MultiArray, flat, as the controllers of ros2_control take it."""
     return make(NUMBERS, make("std_msgs/msg/MultiArrayLayout", [], 0), np.array(values, float))
+
+
+def time_reference(held: Any, image_ns: int) -> Any:
+    """A sensor_msgs/TimeReference: the stamp of the newest image behind what the header's stamp names."""
+    stamp = make("builtin_interfaces/msg/Time", *divmod(image_ns, NANOSECONDS))
+    return make(TIME, held, stamp, "the newest image")
 
 
 def waypoints(message: RawMessage) -> Waypoints:
@@ -81,6 +88,17 @@ def moving_waypoints(message: RawMessage) -> tuple[Waypoints, Motion] | None:
         raise FrameError(f"{message.topic}: a velocity or an acceleration is not finite")
     unknown = np.full(velocities.shape, np.nan)
     return found, Motion(velocities, accelerations, unknown, unknown, unknown)
+
+
+def has_velocities(message: RawMessage) -> bool:
+    """Whether a sensor_msgs/JointState tells velocities: they may be left out.
+
+    Raises
+    ------
+    FrameError
+        If it is damaged.
+    """
+    return len(decoded(message).velocity) > 0
 
 
 def joint_values(message: RawMessage, names: tuple[str, ...], of: str) -> FloatArray:

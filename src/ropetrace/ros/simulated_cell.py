@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ropetrace.config import RopeConfig
 from ropetrace.control.arm import Arm
-from ropetrace.errors import FrameError
+from ropetrace.errors import ConfigError, FrameError
 from ropetrace.evaluation.case1 import CONDITIONS, Case1Settings, rope_config, scenario
 from ropetrace.evaluation.case2 import CONTROL_RATE, PLACEMENTS
 from ropetrace.recordings.ros_frames import frame_messages
@@ -35,9 +35,22 @@ MOST_BEHIND = 0.5
 """A simulation that is slower than real time by more is told, and its clock set, seconds."""
 
 
+_CONDITIONS = {condition.name: condition for condition in CONDITIONS}
+
+ARM_AWAY = 1.5
+"""For how long an arm that is put back says nothing, seconds: whoever drives it must know that it is another."""
+
+
 @dataclass(frozen=True, slots=True)
 class CellSettings:
-    """What is simulated."""
+    """What is simulated.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such condition.
+    """
+
 
     wind: float = 0.0
     """How often the wind turns in a second; 0 is no wind."""
@@ -45,6 +58,12 @@ class CellSettings:
     """One whose start `evaluation.case2.PLACEMENTS` knows: panda or fr3."""
     warm_up: float = 2.0
     """Seconds of simulated time before the first frame."""
+    condition: str = CONDITIONS[0].name
+    """The camera: one of `evaluation.case1.CONDITIONS`, in real time."""
+
+    def __post_init__(self) -> None:
+        if self.condition not in _CONDITIONS:
+            raise ConfigError(f"condition = {self.condition!r}: choose of {', '.join(_CONDITIONS)}")
 
 
 def cell_config() -> RopeConfig:
@@ -65,7 +84,14 @@ class SimulatedCell:
     node : RosNode
         Of the graph.
     settings : CellSettings
-        What is simulated: 480x360 at 30 frames a second, without noise.
+        What is simulated, without noise.
+
+    Attributes
+    ----------
+    simulated : SimulatedScene
+        The rope and its camera.
+    moving : ArmSimulation
+        The arm.
 
     Raises
     ------
@@ -78,22 +104,37 @@ class SimulatedCell:
     def __init__(self, node: RosNode, settings: CellSettings | None = None) -> None:
         settings = settings or CellSettings()
         shared = Case1Settings(warm_up=settings.warm_up)
-        self._simulated = SimulatedScene(scenario(CONDITIONS[0], settings.wind, shared))
-        arm, placement = Arm.named(settings.arm), PLACEMENTS["behind"]
-        self.moving = ArmSimulation(arm, np.array(placement.start), placement.world_from_base())
-        self._arm = arm
+        self.simulated = SimulatedScene(scenario(_CONDITIONS[settings.condition], settings.wind, shared))
+        self._arm = Arm.named(settings.arm)
         self._node = node
         self._images: dict[str, Publisher] = {}
         self._joints = node.publisher("/joint_states", JOINTS)
         self._commands = node.subscription(topic_of(0, "joint_commands"), JOINTS)
         self._reporter = Reporter(node)
         self._warm_up = settings.warm_up
-        self._velocity = np.zeros(arm.count)
+        self._now = 0.0
+        self.put_back()
+
+    def put_back(self) -> None:
+        """Put the arm back to where it started; for `ARM_AWAY` it says nothing and does not move."""
+        placement = PLACEMENTS["behind"]
+        self.moving = ArmSimulation(self._arm, np.array(placement.start), placement.world_from_base())
+        self._arm_start = self._now
+        self._away_until = self._now + ARM_AWAY
+        self._velocity = np.zeros(self._arm.count)
         self._commanded = -COMMAND_LASTS
 
-    def run(self, should_stop: Callable[[], bool]) -> None:
-        """Simulate in real time until told to stop."""
-        camera, rope = self._simulated.camera, self._simulated.rope
+    def run(self, should_stop: Callable[[], bool], on_tick: Callable[[float], object] = lambda now: None) -> None:
+        """Simulate in real time until told to stop.
+
+        Parameters
+        ----------
+        should_stop : callable
+            Is asked at each of `CONTROL_RATE` steps a second.
+        on_tick : callable
+            Is told the seconds since the start at each of them.
+        """
+        camera, rope = self.simulated.camera, self.simulated.rope
         rope.advance(self._warm_up)
         frame = int(np.ceil(self._warm_up * camera.rate)) + 1
         tick = 0
@@ -101,19 +142,20 @@ class SimulatedCell:
         self._reporter.tell(Status.OK, "simulating")
         while not should_stop():
             tick += 1
-            now = tick / CONTROL_RATE
-            self.moving.advance(now, self._command())
+            now = self._now = tick / CONTROL_RATE
+            self.moving.advance(now - self._arm_start, self._command())
             if camera.stamp(frame) <= self._warm_up + now:
-                self._simulated.robot = self.moving.capsules()
-                exposed = camera.expose(self._simulated.scene_at, camera.stamp(frame), frame)
+                self.simulated.robot = self.moving.capsules()
+                exposed = camera.expose(self.simulated.scene_at, camera.stamp(frame), frame)
                 stamp_ns = round((started + camera.stamp(frame) - self._warm_up) * 1e9)
                 self._publish(replace(exposed, stamp_ns=stamp_ns))
                 frame += 1
             rope.advance(self._warm_up + now)
-            if tick % JOINT_STATES_EVERY == 0:
+            if tick % JOINT_STATES_EVERY == 0 and now >= self._away_until:
                 held = header(round((started + now) * 1e9), "")
                 state = messages.joint_state(held, self._arm.joint_names, self.moving.position, self.moving.velocity)
                 self._joints.put(state)
+            on_tick(now)
             ahead = started + now - time.time()
             if ahead < -MOST_BEHIND:
                 started -= ahead
@@ -128,7 +170,7 @@ class SimulatedCell:
                 self._commanded = time.monotonic()
             except FrameError as error:
                 self._reporter.tell(Status.DEGRADED, str(error))
-        if time.monotonic() - self._commanded > COMMAND_LASTS:
+        if time.monotonic() - self._commanded > COMMAND_LASTS or self._now < self._away_until:
             self._velocity = np.zeros(self._arm.count)
         return self._velocity
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from ropetrace.config import RopeConfig
 from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, estimate_status, header, path, pose_array, topic_of
@@ -15,6 +16,9 @@ from ropetrace.ros.reporting import Reporter
 from ropetrace.trackers import make_tracker
 from ropetrace.tracking import estimates_of
 from ropetrace.types import Estimate, Status
+
+if TYPE_CHECKING:
+    from ropetrace.ros.robot_filter import RobotFilter
 
 MAX_FUTURE = 0.02
 """A stamp further ahead of this machine's clock than this is told, seconds."""
@@ -36,12 +40,21 @@ class TrackDeformable:
         Of the rope.
     topics : CameraTopics
         What is read.
+    robot : RobotFilter, optional
+        Takes the arm out of the images.
     """
 
-    def __init__(self, node: RosNode, config: RopeConfig, topics: CameraTopics | None = None) -> None:
+    def __init__(
+        self,
+        node: RosNode,
+        config: RopeConfig,
+        topics: CameraTopics | None = None,
+        robot: RobotFilter | None = None,
+    ) -> None:
         self._node = node
         self._tracker = make_tracker(config)
         self._camera = LiveCamera(node, topics or CameraTopics(), config.asks_for_color)
+        self._robot = robot
         self._reporter = Reporter(node)
         self._outputs: dict[int, dict[str, Publisher]] = {}
         self._output(0)
@@ -61,6 +74,9 @@ class TrackDeformable:
         if seen is not None:
             self._last = time.monotonic()
             self._frames += 1
+            if self._robot is not None:
+                seen = replace(seen, event=self._robot.clear(seen.event))
+                problem = "; ".join(filter(None, [problem, self._robot.fault]))
             self._publish(seen, problem)
             return
         silent = time.monotonic() - self._last
