@@ -68,18 +68,12 @@ def kill_and_resume(recordings: Path, out: Path, count: int) -> None:
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
     before = results(out)
-    with (out / "summary.csv").open(newline="") as file:
-        listed = {row["result"] for row in csv.DictReader(file) if row["result"]}
     done = subprocess.run(command(recordings, out, 2), capture_output=True, text=True, check=False)
     after = results(out)
     again = [path for path in before if before[path] != after[path]]
-    kept = [path for path in again if str(path.relative_to(out)) in listed]
     print(f"killed with {len(before)} results; resumed, exit code {done.returncode}:")
     print(done.stdout + done.stderr, end="")
-    print(
-        f"results {len(after)} of {count}; made a second time: {len(again)} that were being finished when it was "
-        f"killed, {len(kept)} that were listed"
-    )
+    print(f"results {len(after)} of {count}; made a second time: {len(again)}")
 
 
 def print_times(recordings: Path, folder: Path, turns: int) -> None:

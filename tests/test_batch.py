@@ -5,24 +5,26 @@ from __future__ import annotations
 import csv
 import importlib.util
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ropetrace import batch
-from ropetrace.batch import Outcome, ResultFolder, Task, run_batch
+from ropetrace.batch import DiskFullError, Outcome, ResultFolder, Task, run_batch, track_task
 from ropetrace.config import RopeConfig
 from ropetrace.errors import OutputError, RecordingError
 from ropetrace.evaluation import workers
 from ropetrace.recordings.find import find_recordings
 from test_cli import COLOR, Run, rope_frames, run, write_folder, write_mcap
+from test_recorder import small_file_system, wait_until
 
 __all__ = ["run"]
 
@@ -177,8 +179,8 @@ def test_only_one_batch_writes_to_a_folder(tmp_path: Path) -> None:
 def test_names_of_any_bytes_come_back(tmp_path: Path) -> None:
     outcomes = [Outcome(os.fsdecode(b"\xff,\n\"'"), 1, 1, 0, 0, 0.5, "r", "two\nlines, and a comma")]
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "r").touch()
     with ResultFolder(tmp_path / "out", {}, overwrite=True) as folder:
+        (folder.parts / "r").touch()
         folder.add(outcomes[0])
     with ResultFolder(tmp_path / "out", {}, overwrite=False) as folder:
         assert list(folder.outcomes.values()) == outcomes
@@ -192,30 +194,35 @@ class Deadly:
 
     def __fspath__(self) -> str:
         if self.hangs:
-            time.sleep(100)
+            time.sleep(1000)
         os.kill(os.getpid(), signal.SIGKILL)
         return ""
 
 
-def task(out: Path, name: str, recording: Any) -> Task:
-    return Task(recording, name, out, "csv", CONFIG, {})
+def task(name: str, recording: Any) -> Task:
+    return Task(recording, name, "csv", CONFIG, {})
 
 
 def test_a_worker_that_dies_or_hangs_fails_its_recording_alone(
     tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(workers, "LONGEST_SILENCE", 8.0)
     out = tmp_path / "out"
     told: list[Outcome] = []
+
+    def tell(outcome: Outcome) -> None:
+        told.append(outcome)
+        if len(told) == 4:  # the fifth hangs
+            monkeypatch.setattr(workers, "LONGEST_SILENCE", 0.5)
+
     with ResultFolder(out, {}, overwrite=False) as folder:
         tasks = [
-            task(out, "dying", Deadly(hangs=False)),
-            task(out, "hanging", Deadly(hangs=True)),
-            task(out, "good", tree / "day1" / "a"),
-            task(out, "broken", tree / "day2" / "broken.mcap"),
-            task(out, "better", tree / "day1" / "a.mcap"),
+            task("dying", Deadly(hangs=False)),
+            task("hanging", Deadly(hangs=True)),
+            task("good", tree / "day1" / "a"),
+            task("broken", tree / "day2" / "broken.mcap"),
+            task("better", tree / "day1" / "a.mcap"),
         ]
-        run_batch(folder, tasks, jobs=2, on_outcome=told.append)
+        run_batch(folder, tasks, jobs=2, on_outcome=tell)
         found = {name: outcome.error for name, outcome in folder.outcomes.items()}
     assert len(told) == 5
     assert found["dying"] == "its process was killed (SIGKILL)"
@@ -225,19 +232,130 @@ def test_a_worker_that_dies_or_hangs_fails_its_recording_alone(
     assert sorted(path.name for path in out.iterdir()) == ["better.csv", "good.csv", "settings.toml", "summary.csv"]
 
 
-def test_a_result_that_cannot_be_written_is_one_recordings_failure(tmp_path: Path) -> None:
-    outcome = batch.track_task(task(tmp_path, "n" * 300, write_mcap(tmp_path / "b.mcap", rope_frames(2))))
-    assert outcome.failed
-    assert "File name too long" in outcome.error
+def test_a_result_that_cannot_be_written_is_one_recordings_failure(tree: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with ResultFolder(out, {}, overwrite=False) as folder:
+        (out / "taken.csv").mkdir()
+        names = ["n" * 300, "taken", "good"]
+        run_batch(folder, [task(name, tree / "day1" / "a") for name in names])
+        found = {name: outcome.error for name, outcome in folder.outcomes.items()}
+    assert "File name too long" in found["n" * 300]
+    assert "is a folder" in found["taken"]
+    assert found["good"] == ""
+    assert (out / "good.csv").is_file()
+
+
+def test_what_is_listed_is_never_done_again(tmp_path: Path) -> None:
+    """Killed between the row and the move, which is one call later."""
+    out = tmp_path / "out"
+    (tmp_path / "parts" / "day").mkdir(parents=True)
+    (tmp_path / "parts" / "day" / "a.csv").write_text("whole")
+    with ResultFolder(out, {}, overwrite=False) as folder:
+        shutil.copytree(tmp_path / "parts", folder.parts, dirs_exist_ok=True)
+        (folder.parts / "day" / "b.csv").write_text("not listed")
+        folder.add(Outcome("day/a", 3, 3, 0, 0, 0.5, "day/a.csv"))
+    shutil.copytree(tmp_path / "parts", out / ".part-killed")
+    (out / "day" / "a.csv").unlink()
+    with ResultFolder(out, {}, overwrite=False) as folder:
+        assert folder.finished("day/a")
+        assert not folder.finished("day/b")
+    assert sorted(path.name for path in out.rglob("*")) == ["a.csv", "day", "settings.toml", "summary.csv"]
+    assert (out / "day" / "a.csv").read_text() == "whole"
+
+
+def batch_command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "ropetrace", "batch", *arguments, *ROPE]
+
+
+def results_are_there(out: Path, count: int) -> bool:
+    return len(list(out.glob("*.csv"))) > count  # the summary is one
+
+
+def test_killed_half_way_and_resumed_nothing_is_done_twice(run: Run, tree: Path) -> None:
+    many = tree.parent / "many"
+    for index in range(12):
+        shutil.copytree(tree / "day1" / "a", many / f"{index}")
+    for index, content in enumerate((b"nothing", b"", (tree / "day2" / "a.mcap").read_bytes()[:900])):
+        (many / f"broken{index}.mcap").write_bytes(content)
+    out = tree.parent / "out"
+    process = subprocess.Popen(
+        batch_command("many", "--out", "out", "--jobs", "2"),
+        cwd=tree.parent,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    wait_until(lambda: results_are_there(out, 5))
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    before = {name: stamp for name, stamp in results(out).items() if not name.startswith(".")}
+    assert 5 < len(before) < 13
+    # A row more may be there, whose result is moved by the next run.
+    assert before.keys() - {"summary.csv"} <= {row["result"] for row in rows(out).values()}
+    code, told, _ = run("batch", "many", "--out", "out", *ROPE, "--jobs", 1)
+    assert code == 3
+    assert "recordings 15 (12 finished, " in told
+    after = results(out)
+    assert {name for name in before if after[name] != before[name]} == {"summary.csv"}
+    assert run("batch", "many", "--out", "whole", *ROPE, "--jobs", 1)[0] == 3
+    assert results(tree.parent / "whole").keys() == after.keys()
+    for name in after.keys() - {"summary.csv"}:
+        assert (out / name).read_bytes() == (tree.parent / "whole" / name).read_bytes()
+    assert not list(out.glob(".*"))
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    with small_file_system(tmp_path / "disk", 4096) as path:
+        yield path
+
+
+@pytest.mark.parametrize("format", ["csv", "parquet", "npz", "mcap"])
+def test_a_full_disk_is_no_recordings_failure(tree: Path, small_disk: Path, format: str) -> None:
+    if format == "parquet":
+        pytest.importorskip("pyarrow")
+    (small_disk / "filler").write_bytes(bytes(4096 * 1023))
+    with pytest.raises(DiskFullError, match=re.escape(f"{tree.parent}/disk: the disk is full (No space left")):
+        track_task(Task(tree / "day1" / "a", "a", format, CONFIG, {}), make_folder(small_disk / "parts"))
+    assert list((small_disk / "parts").iterdir()) == []
+
+
+def make_folder(path: Path) -> Path:
+    path.mkdir()
+    return path
+
+
+def test_a_full_disk_ends_the_batch_and_the_same_command_goes_on(run: Run, tree: Path, small_disk: Path) -> None:
+    for index in range(12):
+        shutil.copytree(tree / "day1" / "a", tree / "many" / f"{index:02d}")
+    out = small_disk / "out"
+    assert track_task(task("a", tree / "day1" / "a"), tree).result == "a.csv"
+    pages = (tree / "a.csv").stat().st_size // 4096 + 1
+    filler = small_disk / "filler"
+    filler.write_bytes(bytes(4096 * (1024 - 8 - 6 * pages)))
+    arguments = ("batch", "in/many", "--out", out, *ROPE, "--jobs", 2)
+    code, _, err = run(*arguments)
+    assert code == 2
+    kept = [path for path in out.glob("*.csv") if path.name != "summary.csv"]
+    assert err.endswith(
+        f"the disk is full (No space left on device); {len(kept)} of 12 recordings are finished and kept in {out}\n"
+    )
+    assert err.count("\n") == 1
+    assert 0 < len(kept) < 12
+    written = {path: path.stat().st_mtime_ns for path in kept}
+    filler.unlink()
+    code, told, _ = run(*arguments)
+    assert code == 0
+    assert f"recordings 12 (12 finished, {len(kept)} of them before, 0 failed" in told
+    assert written == {path: path.stat().st_mtime_ns for path in kept}
+    assert not list(out.glob(".*"))
 
 
 def test_ctrl_c_keeps_what_is_finished(tree: Path) -> None:
     for index in range(40):
         shutil.copytree(tree / "day1" / "a", tree / "many" / f"{index}")
-    arguments = ["ropetrace", "batch", "in/many", "--out", "out", *ROPE, "--jobs", "1"]
-    code = f"import sys; from ropetrace import cli; sys.argv = {arguments}; cli.main()"
     process = subprocess.Popen(
-        [sys.executable, "-c", code],
+        batch_command("in/many", "--out", "out", "--jobs", "1"),
         cwd=tree.parent,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -245,15 +363,13 @@ def test_ctrl_c_keeps_what_is_finished(tree: Path) -> None:
         start_new_session=True,
     )
     out = tree.parent / "out"
-    deadline = time.monotonic() + 60
-    while len(list(out.glob("*.csv"))) < 4 and time.monotonic() < deadline:
-        time.sleep(0.02)
+    wait_until(lambda: results_are_there(out, 3))
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers get it too
     _, err = process.communicate(timeout=30)
     assert process.returncode == 130, err
     kept = rows(out)
     assert err == f"ropetrace: interrupted; {len(kept)} of 40 recordings are finished and kept in out\n"
-    assert 2 <= len(kept) < 40
+    assert 3 <= len(kept) < 40
     assert not any(row["error"] for row in kept.values())
     assert sorted(results(out)) == sorted([*(row["result"] for row in kept.values()), "summary.csv"])
 

@@ -3,21 +3,27 @@
 On this machine the processes of `ropetrace.evaluation.workers` serve: one that dies or hangs fails its recording alone.
 On a cluster Dask does, by the interface of `concurrent.futures`; its workers read and write the same paths as this
 process.
+
+A worker leaves a whole result in a hidden folder of the run. This process adds the row to the summary and then moves
+the result to its place; a kill between the two is made good by the next run. So what has a result has a row, and what
+has a row is never done again.
 """
 
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import os
 import shutil
 import tempfile
 import time
+import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import ExitStack
-from dataclasses import astuple, dataclass, fields
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import astuple, dataclass, fields, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -25,7 +31,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from ropetrace.config import RopeConfig
-from ropetrace.errors import ConfigError, RecordingError, RopetraceError
+from ropetrace.errors import ConfigError, OutputError, RecordingError, RopetraceError
 from ropetrace.evaluation.run_folder import SettingsFile, replace_file
 from ropetrace.evaluation.runner import dask_executor
 from ropetrace.evaluation.workers import Worker, WorkerLostError, Workers
@@ -33,7 +39,7 @@ from ropetrace.motion import make_motion
 from ropetrace.recordings import open_recording
 from ropetrace.recordings.base import has_color
 from ropetrace.results import open_writer
-from ropetrace.results.base import lock, writing
+from ropetrace.results.base import check_place, lock, uninterrupted, writing
 from ropetrace.trackers import make_tracker
 from ropetrace.tracking import track_recording
 from ropetrace.types import Estimate, Status
@@ -43,8 +49,12 @@ FORMATS = ("csv", "parquet", "npz", "mcap")
 
 SUMMARY = "summary.csv"
 
-_PART = ".part-"
-"""What the folders begin with in which workers write, until a result is whole."""
+_PARTS = ".part-"
+"""What the folder of a run begins with in which workers write."""
+
+
+class DiskFullError(OutputError):
+    """There is no room for results; no recording has a chance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,8 +102,6 @@ class Task:
         Where it is.
     name : str
         Its path below the folder that all recordings are in.
-    out : Path
-        The folder of results; the result is ``<name>.<format>`` below it.
     format : str
         One of `FORMATS`.
     config : RopeConfig
@@ -108,7 +116,6 @@ class Task:
 
     recording: Path
     name: str
-    out: Path
     format: str
     config: RopeConfig
     options: dict[str, Any]
@@ -140,6 +147,8 @@ class ResultFolder:
     ----------
     outcomes : dict of str to Outcome
         By the recording.
+    parts : Path
+        Where the workers of this run leave whole results, absolute; removed at the end.
 
     Raises
     ------
@@ -151,6 +160,7 @@ class ResultFolder:
 
     def __init__(self, path: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
         self.path = path
+        self.parts = path.absolute() / f"{_PARTS}{uuid.uuid4().hex}"
         self.outcomes: dict[str, Outcome] = {}
         self._summary = path / SUMMARY
         file = SettingsFile(path, "batch")
@@ -162,8 +172,9 @@ class ResultFolder:
             handle = os.open(path, os.O_RDONLY)
             stack.callback(os.close, handle)
             lock(handle, path)
-            self._remove_parts()
             before = self._read()
+            self._move_what_is_listed(before)
+            self._remove_parts()
             if overwrite:
                 for outcome in before:
                     (path / outcome.result).unlink(missing_ok=True) if outcome.result else None
@@ -172,6 +183,7 @@ class ResultFolder:
             file.write(settings)
             self._rewrite(self.outcomes.values())
             self._rows = stack.enter_context(self._summary.open("ab", buffering=0))
+            self.parts.mkdir()
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Self:
@@ -183,20 +195,55 @@ class ResultFolder:
         self._remove_parts()
         self._stack.close()
 
+    def _move_what_is_listed(self, outcomes: Iterable[Outcome]) -> None:
+        """A run was killed after it had added a row, and before the result was in its place."""
+        for parts in self.path.glob(_PARTS + "*"):
+            for outcome in outcomes:
+                if outcome.result:
+                    with suppress(OSError):
+                        os.replace(parts / outcome.result, self.path / outcome.result)
+
     def _remove_parts(self) -> None:
-        """What killed workers left behind."""
-        for part in self.path.glob(_PART + "*"):
-            shutil.rmtree(part, ignore_errors=True)
+        for parts in self.path.glob(_PARTS + "*"):
+            shutil.rmtree(parts, ignore_errors=True)
 
     def finished(self, name: str) -> bool:
         """Whether a recording has a result."""
         return name in self.outcomes and not self.outcomes[name].failed
 
-    def add(self, outcome: Outcome) -> None:
-        """Keep the outcome of a recording, whose result is in its place."""
-        self.outcomes[outcome.recording] = outcome
-        with writing(self._summary):
-            self._rows.write(_rows([astuple(outcome)]))
+    def add(self, outcome: Outcome) -> Outcome:
+        """Add the outcome of a recording to the summary, and move its result from `parts` to its place.
+
+        Returns
+        -------
+        Outcome
+            As it is in the summary: a failure where there is no place for the result.
+
+        Raises
+        ------
+        DiskFullError
+            If there is no room.
+        OutputError
+            If the summary cannot be written.
+        """
+        if not outcome.failed:
+            place = self.path / outcome.result
+            try:
+                with _disk_full_told(self.path), writing(place):
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    check_place(place)
+            except DiskFullError:
+                raise
+            except OutputError as error:
+                outcome = replace(outcome, result="", error=str(error))
+        row = _rows([astuple(outcome)])
+        with uninterrupted(), _disk_full_told(self.path), writing(self._summary):
+            if self._rows.write(row) < len(row):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            if not outcome.failed:
+                os.replace(self.parts / outcome.result, self.path / outcome.result)
+            self.outcomes[outcome.recording] = outcome
+        return outcome
 
     def sort(self, names: Sequence[str]) -> None:
         """Put the summary in the order of these recordings; others stay behind them."""
@@ -261,68 +308,113 @@ def run_batch(
     ------
     ConfigError
         If the cluster cannot be reached, or has another version of ropetrace.
+    DiskFullError
+        If there is no room for results.
+    OutputError
+        If the summary cannot be written.
     """
     waiting = [task for task in tasks if not folder.finished(task.name)]
     if not waiting:
         return
-    for outcome in _run_here(waiting, min(jobs, len(waiting))) if cluster is None else _run_there(waiting, cluster):
-        folder.add(outcome)
-        on_outcome(outcome)
+    if cluster is None:
+        run = _run_here(waiting, folder.parts, min(jobs, len(waiting)))
+    else:
+        run = _run_there(waiting, folder.parts, cluster)
+    with closing(run) as outcomes:  # whatever happens, the workers end first
+        for outcome in outcomes:
+            on_outcome(folder.add(outcome))
 
 
-def _run_here(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
+def _run_here(tasks: Sequence[Task], parts: Path, jobs: int) -> Generator[Outcome]:
     waiting = deque(tasks)
     with Workers(jobs) as workers:
         running: dict[Worker, Task] = {}
         while waiting or running:
             while waiting and (worker := workers.idle()):
                 task = running[worker] = waiting.popleft()
-                worker.begin(track_task, task)
+                worker.begin(track_task, task, parts)
             for worker in workers.wait(running):
                 task = running.pop(worker)
                 try:
                     yield worker.result()
+                except DiskFullError:
+                    raise
                 except (RopetraceError, WorkerLostError) as error:
                     yield Outcome(task.name, error=str(error))
 
 
-def _run_there(tasks: Sequence[Task], cluster: str) -> Iterator[Outcome]:
+def _run_there(tasks: Sequence[Task], parts: Path, cluster: str) -> Generator[Outcome]:
     with dask_executor(cluster) as executor:
         wanted = version("ropetrace")
-        running: dict[Future[Outcome], Task] = {executor.submit(_on_cluster, task, wanted): task for task in tasks}
+        running: dict[Future[Outcome], Task] = {
+            executor.submit(_on_cluster, task, parts, wanted): task for task in tasks
+        }
         while running:
             for future in wait(running, timeout=1, return_when=FIRST_COMPLETED)[0]:
                 task = running.pop(future)
                 try:
                     yield future.result()
-                except ConfigError:
+                except (ConfigError, DiskFullError):
                     raise
                 except Exception as error:  # such as Dask's KilledWorker
                     yield Outcome(task.name, error=f"{type(error).__name__}: {error}")
 
 
-def _on_cluster(task: Task, wanted: str) -> Outcome:
+def _on_cluster(task: Task, parts: Path, wanted: str) -> Outcome:
     if version("ropetrace") != wanted:
         raise ConfigError(f"a worker has ropetrace {version('ropetrace')}, not {wanted}")
-    return track_task(task)
+    return track_task(task, parts)
 
 
-def track_task(task: Task, on_frame: Callable[[], object] = lambda: None) -> Outcome:
-    """Track one recording; its result is in its place wholly or not at all.
+def track_task(task: Task, parts: Path, on_frame: Callable[[], object] = lambda: None) -> Outcome:
+    """Track one recording; its result is then in `parts`, wholly or not at all.
 
     Parameters
     ----------
     task : Task
         Which.
+    parts : Path
+        The folder for whole results, that of the `ResultFolder`.
     on_frame : callable
         Is told of every frame.
+
+    Raises
+    ------
+    DiskFullError
+        If there is no room for the result.
     """
     started = time.monotonic()
+    whole = parts / task.result
     try:
-        with writing(task.out), tempfile.TemporaryDirectory(prefix=_PART, dir=task.out) as part:
-            return _tracked(task, Path(part) / f"result.{task.format}", on_frame, started)
+        # Each in a folder of its own: Dask may have a recording tracked twice.
+        with (
+            _disk_full_told(parts.parent),
+            writing(Path(task.result)),
+            tempfile.TemporaryDirectory(dir=parts) as folder,
+        ):
+            part = Path(folder) / f"result.{task.format}"
+            outcome = _tracked(task, part, on_frame, started)
+            whole.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(part, whole)
+            return outcome
+    except DiskFullError:
+        raise
     except RopetraceError as error:
         return Outcome(task.name, seconds=_seconds_since(started), error=str(error))
+
+
+@contextmanager
+def _disk_full_told(folder: Path) -> Generator[None]:
+    """Tell a full disk from other reasons for which a file cannot be written, by what the system said first."""
+    try:
+        yield
+    except OutputError as error:
+        cause: BaseException | None = error
+        while cause is not None:
+            if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise DiskFullError(f"{folder}: the disk is full ({cause.strerror})") from None
+            cause = cause.__context__
+        raise
 
 
 def _tracked(task: Task, part: Path, on_frame: Callable[[], object], started: float) -> Outcome:
@@ -344,9 +436,6 @@ def _tracked(task: Task, part: Path, on_frame: Callable[[], object], started: fl
         )
     if not summary.frames:
         raise RecordingError(f"{task.recording}: there is no frame at or after --start {task.start}")
-    place = task.out / task.result
-    place.parent.mkdir(parents=True, exist_ok=True)
-    os.replace(part, place)
     ok, degraded, lost = (sum(rope.statuses[status] for rope in summary.ropes.values()) for status in Status)
     damage = "; ".join(recording.problems)
     seconds = _seconds_since(started)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tomllib
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,7 +15,7 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from ropetrace.cli_source import Part, TrackedRope
 from ropetrace.errors import OutputError, import_extra
-from ropetrace.terminal import DAMAGED, INTERRUPTED, NOTHING_FOUND, progress_bar
+from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, NOTHING_FOUND, progress_bar
 
 if TYPE_CHECKING:
     from ropetrace.batch import Outcome, ResultFolder
@@ -72,12 +73,18 @@ class Batch:
                         bar.update()
 
                     run_batch(folder, tasks, jobs=jobs, cluster=self.cluster, on_outcome=tell)
-            except KeyboardInterrupt:
+            except (KeyboardInterrupt, OutputError) as error:
+                interrupted = isinstance(error, KeyboardInterrupt)
                 done = f"{sum(folder.finished(task.name) for task in tasks)} of {len(tasks)} recordings"
-                print(f"ropetrace: interrupted; {done} are finished and kept in {self.out}", file=sys.stderr)
-                return INTERRUPTED
+                print(
+                    f"ropetrace: {'interrupted' if interrupted else error}; {done} are finished and kept in {self.out}",
+                    file=sys.stderr,
+                )
+                return INTERRUPTED if interrupted else BAD_INPUT
             finally:
-                folder.sort([task.name for task in tasks])
+                # On a full disk the rows stay in the order in which they came.
+                with suppress(OutputError):
+                    folder.sort([task.name for task in tasks])
             return _tell(folder, [folder.outcomes[task.name] for task in tasks], before)
 
     def _check_out(self, found: Found) -> None:
@@ -97,9 +104,8 @@ class Batch:
             "color_topic": part.color_topic,
             "cloud_topic": part.cloud_topic,
         }
-        out = self.out.absolute()
         tasks = [
-            Task(path, name, out, self.format, config, options, part.start, part.limit)
+            Task(path, name, self.format, config, options, part.start, part.limit)
             for name, path in found.recordings.items()
         ]
         if any(task.result == SUMMARY for task in tasks):

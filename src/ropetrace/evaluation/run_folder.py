@@ -214,8 +214,12 @@ def replace_file(path: Path, data: bytes) -> None:
     """
     part = path.with_name(f".{path.name}.part")
     with writing(path), uninterrupted():
-        part.write_bytes(data)
-        os.replace(part, path)
+        try:
+            part.write_bytes(data)
+            os.replace(part, path)
+        except OSError:
+            part.unlink(missing_ok=True)
+            raise
 
 
 def replace_files(folder: Path, files: dict[str, bytes]) -> list[Path]:

@@ -18,6 +18,7 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExe
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from importlib.metadata import version
+from multiprocessing import resource_tracker
 from typing import Any
 
 from ropetrace.errors import ConfigError, RopetraceError, import_extra
@@ -171,6 +172,8 @@ def dask_executor(address: str) -> Iterator[Executor]:
 @contextmanager
 def without_interrupt() -> Iterator[None]:
     """Processes that are started in the block never see Ctrl-C, which a terminal sends to them too."""
+    # Started with the first of them, it would give that one back the Ctrl-C (Python 3.11).
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
