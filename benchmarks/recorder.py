@@ -5,25 +5,32 @@
 Every writer is given the same messages: 640x480 depth with a Kinect's noise and noisy colour, or small frames of 64x48,
 at 30 Hz. It is killed (SIGKILL to it and its children) at a random moment; a frame is acknowledged when the call that
 wrote it has returned, and counts as readable if our reader, which takes truncated files, gives it back, or, in the last
-column, if the `mcap` library's does after `ropetrace recover`. For BackgroundRecorder the frames that were handed over
-are counted: it acknowledges none before its Recorder has written it. The times depend on this machine; the counts do
-not.
+column, if the `mcap` library's does after `ropetrace recover`. BackgroundRecorder acknowledges a frame when its
+Recorder has written it. `ropetrace record sim:swing` is killed too, with and without a rope to track: there a frame is
+acknowledged when the terminal has told of it, and frames that are missing between others are counted as well. The times
+depend on this machine; the counts do not.
 """
 
 from __future__ import annotations
 
 import argparse
+import fcntl
 import io
 import os
+import pty
 import random
+import re
+import select
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
+import termios
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +57,8 @@ CAMERAS = {
     "64x48": Intrinsics(64, 48, 58, 58, 31.5, 23.5),
 }
 PERIOD = 1 / 30
-Write = Callable[[RgbdFrame], object]
+Write = Callable[[RgbdFrame], int | None]
+"""Takes a frame; gives how many are acknowledged, where it is not all."""
 
 
 def make_frames(size: str, count: int) -> list[RgbdFrame]:
@@ -75,7 +83,12 @@ def recorder(path: Path) -> Iterator[Write]:
 @contextmanager
 def background(path: Path) -> Iterator[Write]:
     with BackgroundRecorder(Recorder(path)) as writer:
-        yield writer.put
+
+        def write(frame: RgbdFrame) -> int:
+            writer.put(frame)
+            return writer.recorder.frames
+
+        yield write
 
 
 @contextmanager
@@ -140,8 +153,8 @@ def be_killed(name: str, size: str, path: Path) -> None:
             due = time.monotonic() + PERIOD
             frame = frames[index % len(frames)]
             stamp = 10**18 + round(index * PERIOD * 1e9)
-            write(RgbdFrame(stamp, frame.depth, 0.001, frame.intrinsics, frame.color))
-            print(index + 1, flush=True)
+            written = write(RgbdFrame(stamp, frame.depth, 0.001, frame.intrinsics, frame.color))
+            print(index + 1 if written is None else written, flush=True)
             time.sleep(max(due - time.monotonic(), 0))
 
 
@@ -188,6 +201,43 @@ def print_kills(folder: Path, count: int) -> None:
                 f"{size:8s} {name:19s} {total:11d} {sum(lost):6d} {max(lost):12d}"
                 + (f" {sum(later):20d}" if later else f"{'':21s}")
             )
+
+
+def kill_command(path: Path, rope: list[str]) -> tuple[int, list[int]]:
+    """Frames that the terminal told of, and the stamps of those that can be read."""
+    path.unlink(missing_ok=True)
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", 40, 100, 0, 0))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ropetrace", "record", "sim:swing", "--out", str(path), *rope],
+        stdout=subprocess.DEVNULL,
+        stderr=theirs,
+        start_new_session=True,
+    )
+    os.close(theirs)
+    shown, end = b"", float("inf")
+    with process, suppress(OSError):
+        while time.monotonic() < end:
+            if select.select([ours], [], [], 0.1)[0]:
+                shown += os.read(ours, 65536)
+            if end == float("inf") and re.search(rb"[1-9]frame \[", shown):
+                end = time.monotonic() + random.uniform(0.5, 3)
+        os.killpg(process.pid, signal.SIGKILL)
+        while more := os.read(ours, 65536):
+            shown += more
+    os.close(ours)
+    stamps = [event.stamp_ns for event in open_recording(path).frames() if not isinstance(event, BadFrame)]
+    return max(map(int, re.findall(rb"(\d+)frame \[", shown))), stamps
+
+
+def print_command_kills(folder: Path, count: int) -> None:
+    print(f"\n{count} kills of ropetrace record  told of   lost   missing between others")
+    rope = ["--diameter", "15mm", "--color", "#c8281e"]
+    for name, options in (("frames alone", []), ("tracked", rope)):
+        kills = [kill_command(folder / "killed.mcap", options) for _ in range(count)]
+        missing = sum(round(step / 1e9 / PERIOD) - 1 for _, stamps in kills for step in np.diff(stamps))
+        lost = sum(max(told - len(stamps), 0) for told, stamps in kills)
+        print(f"{name:28s} {sum(told for told, _ in kills):7d} {lost:6d} {missing:8d}")
 
 
 def print_speed(folder: Path, count: int) -> None:
@@ -280,6 +330,7 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         print_kills(Path(folder), options.kills)
+        print_command_kills(Path(folder), options.kills)
         print_speed(Path(folder), options.frames)
         print_compressions()
         print_sync(Path(folder))

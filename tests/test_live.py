@@ -136,6 +136,27 @@ def test_a_slow_reader_gets_the_newest_and_the_others_are_counted() -> None:
     assert late == recording.dropped - recording.dropped_at_start
 
 
+def test_whoever_wants_all_frames_is_given_them() -> None:
+    recording = live(ScriptedCamera(steady, period=0.002))
+    given: list[Event] = []
+    recording.on_event = given.append
+    taken = []
+    for event in recording.frames(limit=5):
+        assert given[-1].stamp_ns >= event.stamp_ns, "before anybody takes it"
+        taken.append(event)
+        time.sleep(0.03)
+    assert [event.stamp_ns for event in given] == [steady(index).stamp_ns for index in range(len(given))]
+    assert len(given) > 20
+    assert all(any(event is other for other in given) for event in taken)
+
+
+def test_a_fault_of_whoever_wants_all_frames_is_told() -> None:
+    recording = live(ScriptedCamera(steady))
+    recording.on_event = lambda event: 1 / 0
+    with pytest.raises(RecordingError, match="ZeroDivisionError"):
+        next(recording.frames())
+
+
 def test_frames_that_nobody_takes_need_no_memory() -> None:
     camera = ScriptedCamera(lambda index: tiny(index, Intrinsics(400, 300, 300.0, 300.0, 199.5, 149.5)), period=0.001)
     frames = live(camera).frames()

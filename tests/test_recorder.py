@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import fcntl
+import math
 import os
+import pty
 import random
+import re
 import resource
+import select
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +30,15 @@ from mcap.reader import make_reader
 
 from recordings_samples import contents
 from ropetrace.errors import FrameError, OutputError, RecordingError
+from ropetrace.live import CameraGoneError, LiveRecording
 from ropetrace.recorder import BackgroundRecorder, Recorder
 from ropetrace.recordings import open_recording
 from ropetrace.recordings.mcap_recover import recover
 from ropetrace.results import open_writer
 from ropetrace.results.base import WholeFile
-from ropetrace.types import CloudFrame, Estimate, Frame, Intrinsics, RgbdFrame
+from ropetrace.types import BadFrame, CloudFrame, Estimate, Frame, Intrinsics, RgbdFrame
 from test_cli import Run, rope_frames, run, write_mcap
+from test_live import Script, ScriptedCamera, quick_scenario, tiny
 
 __all__ = ["run"]
 
@@ -75,6 +85,27 @@ def file_limit(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@contextmanager
+def small_file_system(path: Path, kibibytes: int) -> Iterator[Path]:
+    """A disk that is soon full."""
+    path.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={kibibytes}k", "ropetrace-test", str(path)]
+    if os.geteuid() != 0 or subprocess.run(mount, check=False, capture_output=True).returncode != 0:
+        pytest.skip("only root may mount a small file system")
+    try:
+        yield path
+    finally:
+        subprocess.run(["umount", "--lazy", str(path)], check=True)
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    """Fails after a minute."""
+    deadline = time.monotonic() + 60
+    while not holds():
+        assert time.monotonic() < deadline, "it never came to that"
+        time.sleep(0.01)
 
 
 @pytest.mark.parametrize("color", [True, False])
@@ -155,7 +186,9 @@ def test_kill_minus_nine_loses_no_acknowledged_frame(tmp_path: Path, how: str, a
     )
     assert process.stdout is not None
     with process:
-        acknowledged = int(process.stdout.readline())
+        acknowledged = 0
+        while not acknowledged:
+            acknowledged = int(process.stdout.readline())
         end = time.monotonic() + random.uniform(0.05, 0.6)
         while time.monotonic() < end:
             acknowledged = int(process.stdout.readline())
@@ -239,6 +272,8 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path) -> None
 
 def test_a_disk_that_fails_late_ends_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(file: WholeFile) -> None:
+        if file.size < 100_000:
+            return
         raise OutputError("a.mcap: cannot be written: Input/output error")
 
     monkeypatch.setattr("ropetrace.recorder.SYNC_SECONDS", 0.01)
@@ -257,13 +292,43 @@ def test_a_disk_that_fails_late_ends_the_recording(tmp_path: Path, monkeypatch: 
     assert len(read(tmp_path / "a.mcap")) == recorder.frames
 
 
+def test_a_disk_that_fails_after_the_last_frame_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The system tells of it once, and only whoever asks first."""
+    told = threading.Event()
+
+    def fail_once(file: WholeFile) -> None:
+        if not told.is_set():
+            told.set()
+            raise OutputError("a.mcap: cannot be written: Input/output error")
+
+    monkeypatch.setattr("ropetrace.recorder.SYNC_SECONDS", 0.01)
+    monkeypatch.setattr(WholeFile, "sync", fail_once)
+    background = BackgroundRecorder(Recorder(tmp_path / "a.mcap"))
+    told.wait(10)
+    with pytest.raises(OutputError, match="Input/output error"):
+        background.close()
+    background.close()
+
+
+def test_what_comes_after_the_end_is_counted_and_nobody_waits(tmp_path: Path) -> None:
+    background = BackgroundRecorder(Recorder(tmp_path / "a.mcap"))
+    background.put(noise_frame(0))
+    background.close()
+    background.put(noise_frame(1))
+    assert not background.offer(noise_frame(2))
+    background.write(3, Estimate.lost(1, "nothing"))
+    assert (background.recorder.frames, background.dropped, background.dropped_estimates) == (1, 2, 1)
+
+
 def test_the_disk_is_made_to_take_it_twice_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
     monkeypatch.setattr(WholeFile, "sync", lambda file: calls.append(threading.current_thread().name))
     with Recorder(tmp_path / "a.mcap") as recorder:
         recorder.write(noise_frame(0))
-        time.sleep(1.2)
-        assert calls == ["recorder sync"] * 2
+        started = time.monotonic()
+        wait_until(lambda: len(calls) == 3)
+        assert time.monotonic() - started > 0.9
+        assert calls == ["recorder sync"] * 3
 
 
 def test_what_does_not_fit_the_queue_is_dropped_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -380,7 +445,7 @@ def test_record_on_a_full_disk_says_so(run: Run, tmp_path: Path) -> None:
     with file_limit(100_000):
         code, out, err = run("record", "in.mcap", "--out", "out.mcap")
     assert code == 2
-    assert "dropped" in out
+    assert "lost" in out
     assert err == "ropetrace: out.mcap: cannot be written: File too large; what was recorded before is kept\n"
     assert len(read(tmp_path / "out.mcap")) >= 3
 
@@ -420,3 +485,164 @@ def test_ctrl_c_leaves_a_whole_file(tmp_path: Path, number: signal.Signals) -> N
     assert contents(found) == contents([noise_frame(index) for index in range(len(found))])
     assert 2 <= len(found) < 200
     assert_whole(out)
+
+
+# Live cameras
+
+
+class Slow:
+    """A tracker that takes three frames' time of a camera of 30 Hz, and finds nothing."""
+
+    def update(self, frame: Frame | BadFrame, lap: Any = None) -> Estimate:
+        time.sleep(0.1)
+        return Estimate.lost(frame.stamp_ns, "not looked for")
+
+    def cloud(self) -> None:
+        return None
+
+    def reset(self) -> None: ...
+
+
+def set_camera(monkeypatch: pytest.MonkeyPatch, script: Script, **options: Any) -> None:
+    """Have ``sim:`` be this camera."""
+    monkeypatch.setattr("ropetrace.live.simulated.SimulatedCamera", lambda name: ScriptedCamera(script, **options))
+
+
+def number(words: str, text: str) -> int:
+    """The figure before these words."""
+    found = re.search(rf"(\d+) {words}", text)
+    assert found is not None, text
+    return int(found[1])
+
+
+def test_a_camera_is_recorded_whole_while_the_tracker_is_busy(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ropetrace.trackers.make_tracker", lambda config: Slow())
+    scenario = quick_scenario(tmp_path, 30.0)
+    code, out, _ = run("record", f"sim:{scenario}", "--out", "out.mcap", "--diameter", "12mm", "--limit", 60)
+    assert code == 0
+    stamps = [frame.stamp_ns for frame in read(tmp_path / "out.mcap")]
+    assert len(stamps) == 60
+    np.testing.assert_allclose(np.diff(stamps), 1e9 / 30, atol=2)
+    tracked = [stamp for topic, stamp, _ in messages(tmp_path / "out.mcap") if topic.endswith("status")]
+    assert 3 <= len(tracked) < 40
+    assert set(tracked) <= set(stamps)
+    assert tracked[-1] > 0.6 * stamps[-1], "the newest frame is tracked, not the next one"
+    assert f"frames    {len(tracked)} (" in out
+    assert number("frames that came while the tracker was busy", out) == 60 - len(tracked)
+    assert_whole(tmp_path / "out.mcap")
+
+
+def test_a_camera_that_is_faster_than_the_disk_is_told(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = Recorder.write
+
+    def slow(recorder: Recorder, frame: Frame) -> None:
+        time.sleep(0.02)
+        write(recorder, frame)
+
+    monkeypatch.setattr(Recorder, "write", slow)
+    monkeypatch.setattr("ropetrace.recorder.BackgroundRecorder", partial(BackgroundRecorder, limit=3 * 64 * 48 * 5))
+    set_camera(monkeypatch, noise_frame, period=0.001)
+    code, out, err = run("record", "sim:", "--out", "out.mcap", "--limit", 80)
+    assert code == 3
+    assert "part of the frames is not in the recording" in err
+    recorded, lost = number("frames, ", out), number("frames and 0 estimates that the disk was too slow", out)
+    assert recorded + lost == 80
+    assert lost > 20
+    assert recorded == len(read(tmp_path / "out.mcap")) >= 3
+
+
+def test_a_camera_that_goes_off_for_good_leaves_what_was_recorded(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def script(index: int) -> Frame | Exception:
+        return noise_frame(index) if index < 20 else CameraGoneError("the cable was pulled")
+
+    set_camera(monkeypatch, script, absent=10**6)
+    defaults = LiveRecording.__init__.__kwdefaults__
+    assert defaults is not None
+    monkeypatch.setitem(defaults, "give_up", 0.3)
+    code, out, err = run("record", "sim:", "--out", "out.mcap")
+    assert code == 2
+    assert "recorded  20 frames" in out
+    assert re.fullmatch(r"ropetrace: sim:: .* gave no frame for \d\.\d s: .*; what was recorded before is kept\n", err)
+    assert contents(read(tmp_path / "out.mcap")) == contents([noise_frame(index) for index in range(20)])
+    assert_whole(tmp_path / "out.mcap")
+
+
+def test_frames_of_another_size_are_left_out_and_told(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_camera(monkeypatch, lambda index: tiny(index) if index % 10 == 5 else noise_frame(index))
+    code, out, err = run("record", "sim:", "--out", "out.mcap", "--limit", 30)
+    assert code == 3
+    assert "recorded  27 frames" in out
+    assert "refused   3 x its camera, size, unit or colour is not that of the first frame" in out
+    assert "part of the frames is not in the recording" in err
+    assert len(read(tmp_path / "out.mcap")) == 27
+
+
+def test_a_clock_that_jumps_loses_no_frame(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def script(index: int) -> Frame:
+        jump = -3600 * 10**9 if index >= 10 else 0
+        return dataclasses.replace(noise_frame(index), stamp_ns=noise_frame(index).stamp_ns + jump)
+
+    set_camera(monkeypatch, script)
+    code, out, _ = run("record", "sim:", "--out", "out.mcap", "--limit", 20)
+    assert code == 0
+    assert "jumped 1 times, by 3600." in out
+    assert contents(read(tmp_path / "out.mcap")) == contents([script(index) for index in range(20)])
+    assert_whole(tmp_path / "out.mcap")
+
+
+def test_a_disk_that_fills_up_ends_the_recording_of_a_camera(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_camera(monkeypatch, noise_frame)
+    with small_file_system(tmp_path / "disk", 256) as disk:
+        code, out, err = run("record", "sim:", "--out", disk / "out.mcap")
+        assert code == 2
+        reason = f"{disk}/out.mcap: cannot be written: No space left on device"
+        assert err == f"ropetrace: {reason}; what was recorded before is kept\n"
+        found = read(disk / "out.mcap")
+        assert number("frames, ", out) == len(found) >= 5
+        assert contents(found) == contents([noise_frame(index) for index in range(len(found))])
+
+
+@pytest.mark.parametrize("rope", [(), ("--diameter", "12mm")])
+def test_kill_minus_nine_loses_no_frame_that_the_terminal_told_of(tmp_path: Path, rope: tuple[str, ...]) -> None:
+    path = tmp_path / "out.mcap"
+    acknowledged = killed_on_a_terminal(f"sim:{quick_scenario(tmp_path, 100.0)}", path, rope, random.uniform(0.1, 1))
+    found = read(path)
+    assert len(found) >= acknowledged > 0
+    np.testing.assert_allclose(np.diff([frame.stamp_ns for frame in found]), 1e7, atol=2)
+
+
+def killed_on_a_terminal(source: str, path: Path, rope: tuple[str, ...], seconds: float) -> int:
+    """Record, kill it these seconds after the terminal told of a frame; how many it told of."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", 40, 100, 0, 0))
+    command = [sys.executable, "-m", "ropetrace", "record", source, "--out", str(path), *rope]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs, start_new_session=True)
+    os.close(theirs)
+    shown = b""
+
+    def told() -> int:
+        return max(map(int, re.findall(rb"(\d+)frame \[", shown)), default=0)
+
+    with process:
+        end = math.inf
+        while process.poll() is None and time.monotonic() < end:
+            if select.select([ours], [], [], 0.1)[0]:
+                shown += os.read(ours, 65536)
+            if end == math.inf and told():
+                end = time.monotonic() + seconds
+        os.killpg(process.pid, signal.SIGKILL)
+    with suppress(OSError):  # the terminal is gone when all is read
+        while more := os.read(ours, 65536):
+            shown += more
+    os.close(ours)
+    return told()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass, fields
 from functools import partial
@@ -14,16 +14,17 @@ import tyro
 from tyro.conf import OmitArgPrefixes, arg
 
 from ropetrace.cli_source import Source, TrackedRope
-from ropetrace.errors import ConfigError, OutputError
+from ropetrace.errors import ConfigError, OutputError, RopetraceError
 from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND, progress_bar
 
 if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
+    from ropetrace.live import LiveRecording
     from ropetrace.recorder import BackgroundRecorder
     from ropetrace.recordings import Recording
     from ropetrace.trackers import Tracker
     from ropetrace.tracking import Summary
-    from ropetrace.types import Event
+    from ropetrace.types import Event, Frame
 
 
 @dataclass(frozen=True)
@@ -101,21 +102,25 @@ class _Run:
     def __init__(self, source: Source, recording: Recording, recorder: BackgroundRecorder) -> None:
         from ropetrace.live import LiveRecording
 
-        self._source = source
+        self._part = source.part
         self._recording = recording
         self._recorder = recorder
         self._live = recording if isinstance(recording, LiveRecording) else None
+        self._came = 0
         self._unreadable = 0
+        self._tracked = 0
+        self._last: Event | None = None
+        self._fault: RopetraceError | None = None
 
     def frames(self) -> Summary:
         """Record without tracking."""
         from ropetrace.tracking import Summary
 
         summary = Summary()
-        with self._bar() as bar, closing(self._recorded()) as events:
+        with self._bar() as bar, closing(self._events()) as events:
             try:
                 for _ in events:
-                    bar.update()
+                    self._show(bar)
                     if self._should_stop():
                         break
             except KeyboardInterrupt:
@@ -128,14 +133,15 @@ class _Run:
         from ropetrace.motion import make_motion
         from ropetrace.tracking import track_recording
 
-        with self._bar() as bar, closing(self._recorded()) as events:
+        with self._bar() as bar, closing(self._events()) as events:
             return track_recording(
                 events,
                 tracker,
                 [self._recorder],
                 motion=partial(make_motion, config.motion.method, config.diameter),
-                first_index=self._source.part.start,
-                on_frame=lambda estimate: bar.update(),
+                first_index=self._part.start,
+                age=None if self._live is None else self._live.age,
+                on_frame=lambda estimate: self._show(bar),
                 should_stop=self._should_stop,
             )
 
@@ -146,7 +152,7 @@ class _Run:
         print(f"recorded  {written.frames} frames, {written.size / 1e6:.1f} MB")
         if recorder.dropped or recorder.dropped_estimates:
             print(
-                f"dropped   {recorder.dropped} frames and {recorder.dropped_estimates} estimates that the disk was too "
+                f"lost      {recorder.dropped} frames and {recorder.dropped_estimates} estimates that the disk was too "
                 "slow or too full for"
             )
         for reason, count in recorder.refused.items():
@@ -155,12 +161,17 @@ class _Run:
             print(f"left out  {self._unreadable} frames that the source could not give")
         if tracked:
             print("\n".join(summary.lines()))
-        if self._live is not None:
-            print("\n".join(self._live.lines()))
+            untracked = self._came - self._unreadable - self._tracked
+            if untracked:
+                print(f"untracked {untracked} frames that came while the tracker was busy with an earlier one")
+        for line in [] if self._live is None else self._live.clock_lines():
+            print(line)
         for problem in recording.problems:
             print(f"damage    {problem}")
-        if recorder.failure is not None:
-            print(f"ropetrace: {recorder.failure}; what was recorded before is kept", file=sys.stderr)
+        fault = recorder.failure or self._fault
+        if fault is not None:
+            kept = "; what was recorded before is kept" if written.frames else ""
+            print(f"ropetrace: {fault}{kept}", file=sys.stderr)
             return BAD_INPUT
         if written.frames:
             print(f"written   {written.path}")
@@ -176,27 +187,66 @@ class _Run:
             return DAMAGED
         return 0
 
-    def _recorded(self) -> Generator[Event]:
-        """The frames, each handed to the recorder first. A file waits for the disk, a camera does not."""
+    def _events(self) -> Generator[Event]:
+        """The frames that are to be tracked; all are recorded, and a fault of the source ends them."""
         from ropetrace.types import BadFrame
 
-        part = self._source.part
-        for event in self._recording.frames(part.start, part.limit):
-            if isinstance(event, BadFrame):
-                self._unreadable += 1
-            elif self._live is None:
-                self._recorder.put(event)
-            else:
-                self._recorder.offer(event)
+        try:
+            for event in self._from_file() if self._live is None else self._from_camera(self._live):
+                self._tracked += not isinstance(event, BadFrame)
+                yield event
+        except RopetraceError as error:
+            if not self._came:
+                raise
+            self._fault = error
+
+    def _from_file(self) -> Generator[Event]:
+        """Every frame; it waits for the disk."""
+        for event in self._recording.frames(self._part.start, self._part.limit):
+            self._take(event, self._recorder.put)
             yield event
+
+    def _from_camera(self, live: LiveRecording) -> Generator[Event]:
+        """The newest frame each time, while the camera's thread has every frame recorded."""
+        live.on_event = self._take_until_limit
+        try:
+            for event in live.frames():
+                last = self._last
+                if last is None or event is last:
+                    yield event
+                if last is not None:
+                    return
+        finally:
+            live.close()
+
+    def _take_until_limit(self, event: Event) -> None:
+        if self._last is None:
+            self._take(event, self._recorder.offer)
+            if self._came == self._part.limit:
+                self._last = event
+
+    def _take(self, event: Event, hand_over: Callable[[Frame], object]) -> None:
+        from ropetrace.types import BadFrame
+
+        self._came += 1
+        if isinstance(event, BadFrame):
+            self._unreadable += 1
+        else:
+            hand_over(event)
 
     def _should_stop(self) -> bool:
         return bool(INTERRUPTS) or self._recorder.failure is not None
 
     def _bar(self) -> Any:
-        count, part = self._recording.frame_count, self._source.part
+        count, part = self._recording.frame_count, self._part
         left = None if count is None else max(count - part.start, 0)
         return progress_bar(part.limit if left is None or (part.limit or left) < left else left, "frame")
+
+    def _show(self, bar: Any) -> None:
+        """The frames that no kill can take any more; those in the queue are not among them."""
+        if self._recorder.dropped:
+            bar.set_postfix_str(f"{self._recorder.dropped} lost, the disk is too slow", refresh=False)
+        bar.update(self._recorder.recorder.frames - bar.n)
 
 
 def _check_color(recording: Recording, config: RopeConfig, start: int) -> None:

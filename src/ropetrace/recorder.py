@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections import Counter, deque
 from collections.abc import Mapping
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,10 @@ class Recorder(Closing):
         self._closing.set()
         self._syncing.join()
         self._file.close()
+        # The system tells of a fault of the disk once: asked again by `close`, it knows of none.
+        error, self._sync_error = self._sync_error, None
+        if error is not None:
+            raise error
 
     def _append(self, messages: list[RawMessage]) -> None:
         if self._sync_error is not None:
@@ -147,7 +152,7 @@ class BackgroundRecorder(Closing):
     failure : OutputError, optional
         Why the recording has ended.
     dropped : int
-        Frames that were not written since the disk was too slow, or had failed.
+        Frames that were not written since the disk was too slow or had failed, or the recording had ended.
     refused : Counter of str
         Frames and estimates that cannot be in this recording, by the reason.
     dropped_estimates : int
@@ -172,26 +177,18 @@ class BackgroundRecorder(Closing):
     def offer(self, frame: Frame) -> bool:
         """Hand over a frame without waiting; whether there was room for it."""
         with self._changed:
-            if not self._takes(frame):
-                self.dropped += 1
-                return False
-            self._put(frame)
-        return True
+            return self._add(frame)
 
     def put(self, frame: Frame) -> None:
         """Hand over a frame, and wait until there is room: for sources that wait, as files do."""
         with self._changed:
-            while self.failure is None and not self._takes(frame):
-                self._changed.wait()
-            if self.failure is None:
-                self._put(frame)
-            else:
-                self.dropped += 1
+            self._changed.wait_for(lambda: self._has_ended or self._has_room(frame))
+            self._add(frame)
 
     def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
         """Hand over an estimate without waiting; a `ropetrace.tracking.Sink`."""
         with self._changed:
-            if self.failure is not None or self._estimates >= QUEUE_ESTIMATES:
+            if self._has_ended or self._estimates >= QUEUE_ESTIMATES:
                 self.dropped_estimates += 1
                 return
             self._estimates += 1
@@ -204,23 +201,31 @@ class BackgroundRecorder(Closing):
         Raises
         ------
         OutputError
-            If the disk refuses the end; see also `failure`.
+            If the disk refuses the end; where it refused before, `failure` says so.
         """
         with uninterrupted():
             with self._changed:
                 self._closing = True
                 self._changed.notify_all()
             self._thread.join()
-            self.recorder.close()
+            with suppress(OutputError) if self.failure is not None else nullcontext():
+                self.recorder.close()
 
-    def _takes(self, frame: Frame) -> bool:
-        fits = not self._frames_bytes or self._frames_bytes + _bytes_of(frame) <= self._limit
-        return self.failure is None and not self._closing and fits
+    @property
+    def _has_ended(self) -> bool:
+        return self.failure is not None or self._closing
 
-    def _put(self, frame: Frame) -> None:
+    def _has_room(self, frame: Frame) -> bool:
+        return not self._frames_bytes or self._frames_bytes + _bytes_of(frame) <= self._limit
+
+    def _add(self, frame: Frame) -> bool:
+        if self._has_ended or not self._has_room(frame):
+            self.dropped += 1
+            return False
         self._frames_bytes += _bytes_of(frame)
         self._items.append(frame)
         self._changed.notify_all()
+        return True
 
     def _work(self) -> None:
         while True:

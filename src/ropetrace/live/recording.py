@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ropetrace.errors import RecordingError
@@ -44,6 +44,9 @@ class LiveRecording:
 
     Attributes
     ----------
+    on_event : callable, optional
+        Is given every frame that comes, also those that nobody takes, before it can be taken: for a recorder. It is
+        called by the camera's thread, and must be quick. Counts from the next call of `frames`.
     intrinsics : Intrinsics, optional
         Of the newest frame that was taken; None before the first, and for clouds.
     problems : list of str
@@ -64,6 +67,7 @@ class LiveRecording:
         self.problems: list[str] = []
         self.dropped = 0
         self.dropped_at_start = 0
+        self.on_event: Callable[[Event], object] | None = None
         self._camera = camera
         self._silence = silence
         self._give_up = give_up
@@ -90,7 +94,7 @@ class LiveRecording:
         self.close()
         self.dropped = self.dropped_at_start = 0
         self._clock, self._newest = ClockWatch(), None
-        stream = self._stream = Stream(self._camera)
+        stream = self._stream = Stream(self._camera, self.on_event)
         begin = heard = time.monotonic()
         silent = 0.0
         try:
@@ -144,8 +148,12 @@ class LiveRecording:
         return [
             f"dropped   {late} frames that came while an earlier one was worked on, "
             f"and {self.dropped_at_start} during the first two",
-            *self._clock.lines(),
+            *self.clock_lines(),
         ]
+
+    def clock_lines(self) -> list[str]:
+        """What the stamps did that a clock would not, for people; most often nothing."""
+        return self._clock.lines()
 
     def info(self) -> RecordingInfo:
         """Look at the camera for two seconds, and say what comes.

@@ -1,13 +1,15 @@
-"""A thread that fetches the frames of a camera, and keeps only the newest."""
+"""A thread that fetches the frames of a camera, shows each to whoever wants all, and keeps only the newest."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 
 from ropetrace.errors import RecordingError, RopetraceError
 from ropetrace.live.camera import Camera, CameraGoneError, Capture
 from ropetrace.recordings.base import one_line
+from ropetrace.types import Event
 
 FETCH_SECONDS = 0.1
 """How long a camera may wait for a frame before it is asked whether to stop."""
@@ -32,6 +34,8 @@ class Stream:
     ----------
     camera : Camera
         Is connected and asked for frames by the thread alone.
+    on_event : callable, optional
+        Is given every frame by the thread, before anybody can take it. It must be quick: the camera waits for it.
 
     Attributes
     ----------
@@ -41,10 +45,11 @@ class Stream:
         Why the camera is gone; empty while it is there.
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, on_event: Callable[[Event], object] | None = None) -> None:
         self.dropped = 0
         self.trouble = ""
         self._camera = camera
+        self._on_event = on_event
         self._changed = threading.Condition()
         self._newest: Capture | None = None
         self._failure: Exception | None = None
@@ -114,6 +119,8 @@ class Stream:
                 return
 
     def _put(self, capture: Capture) -> None:
+        if self._on_event is not None:
+            self._on_event(capture.event)
         with self._changed:
             self.dropped += self._newest is not None
             self._newest = capture
