@@ -21,17 +21,8 @@ from ropetrace.results import live, open_writer
 from ropetrace.results.live import LiveViewer
 from ropetrace.results.rrd import RrdWriter
 from ropetrace.types import Cloud, CloudFrame, Estimate, Frame, Status, Waypoints
-from ropetrace.viewer import (
-    AXES,
-    CLOUD_POINTS,
-    IMAGE_WIDTH,
-    NO_NODE_COLOR,
-    NODE_COLORS,
-    VELOCITY_COLOR,
-    VELOCITY_SECONDS,
-    ArmView,
-    rope_color,
-)
+from ropetrace.viewer import CLOUD_POINTS, IMAGE_WIDTH, NO_NODE_COLOR, ArmView, RerunLog, new_recording
+from ropetrace.viewer_shapes import AXES, NODE_COLORS, VELOCITY_COLOR, VELOCITY_SECONDS, rope_color
 
 Rows = dict[str, dict[int | None, dict[str, Any]]]
 
@@ -127,9 +118,34 @@ def test_seen_and_hidden_parts_are_apart(path: Path) -> None:
     assert np.flatnonzero(~item.seen).tolist() == list(range(18, 32))
     for strip, expected in zip(strips, (places[:18], places[32:]), strict=True):
         np.testing.assert_allclose(strip, expected, atol=1e-6)
-    (hidden,) = rows["/rope/hidden"][0]["LineStrips3D:strips"]
-    np.testing.assert_allclose(hidden, places[17:33], atol=1e-6)
+    # Dashes from end to end, dark and light in turn.
+    dashes = np.array(rows["/rope/hidden"][0]["LineStrips3D:strips"])
+    np.testing.assert_allclose(dashes, np.stack([places[17:32], places[18:33]], axis=1), atol=1e-6)
+    shades = rgb(rows["/rope/hidden"][0]["LineStrips3D:colors"])
+    assert all(max(shade) < 50 for shade in shades[1::2])
+    assert all(min(shade) > 150 for shade in shades[::2])
     assert rgb(rows["/rope/centerline"][0]["LineStrips3D:colors"]) == [tuple(rope_color(0))]
+
+
+def test_a_live_log_spares_its_viewers_and_tells_those_who_come_late(path: Path) -> None:
+    """Six seconds of 30 Hz: all in the plots, every second one shown, two depth images a second, the status twice."""
+    recording = new_recording()
+    recording.save(path)
+    log = RerunLog(recording, live=True)
+    for index in range(180):
+        reasons = (f"{index} % of the rope is hidden",)
+        item = dataclasses.replace(estimate(3), stamp_ns=FIRST_STAMP + index * 33_333_333, reasons=reasons)
+        log.log(index, item, frame(index), cloud(index))
+    recording.disconnect()
+    rows = read_back(path)
+    assert set(rows["/plots/length"]) == set(range(180))
+    for name in ("camera/image", "rope/cloud", "rope/centerline", "rope"):
+        assert set(rows[f"/{name}"]) == set(range(0, 180, 2)), name
+    assert set(rows["/camera/depth"]) == set(range(0, 180, 14))
+    assert set(rows["/status"]) == {0, 136}
+    # What is static is not dropped with the oldest.
+    assert set(rows["/camera"]) == {None}
+    assert "Pinhole:resolution" in rows["/camera"][None]
 
 
 def test_rings_are_as_wide_as_the_trackers_sigma_across_the_hidden_part(path: Path) -> None:

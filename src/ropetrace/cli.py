@@ -5,14 +5,11 @@ from __future__ import annotations
 import io
 import signal
 import sys
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from tyro.conf import OmitArgPrefixes, arg
@@ -21,15 +18,16 @@ from ropetrace.cli_batch import Batch
 from ropetrace.cli_compare import Compare
 from ropetrace.cli_node import Node
 from ropetrace.cli_record import Record, Recover
-from ropetrace.cli_simulation import Reproduce, Simulate, parse_duration
+from ropetrace.cli_serve import Serve
+from ropetrace.cli_simulation import Reproduce, Simulate
 from ropetrace.cli_source import Part, Source, TrackedRope
 from ropetrace.cli_trace import Trace
+from ropetrace.cli_track import Track, track
 from ropetrace.cli_tune import Tune
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
-from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND, progress_bar
+from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND
 
 if TYPE_CHECKING:
-    from ropetrace.config import RopeConfig
     from ropetrace.recordings import Recording
 
 _DOCTOR_PICTURE = Path("ropetrace-doctor.png")
@@ -59,7 +57,7 @@ class Demo:
         result, picture = self.out / "result.csv", self.out / "result.png"
         print("tracking it (the first run on a machine compiles for some seconds) ...")
         truth = _TruthOfDemo()
-        code = _track(
+        code = track(
             open_recording(recording_folder), config, [result], picture=picture, overwrite=True, extra_sinks=[truth]
         )
         print(f"error     {truth.mean() * 1e3:.2f} mm mean distance to the true centreline (symmetric)")
@@ -69,51 +67,6 @@ class Demo:
             f"  ropetrace track {recording_folder} --diameter 12mm --color '{config.color}' --out my-result.csv"
         )
         return code
-
-
-@dataclass(frozen=True)
-class Track:
-    """Track the rope through a recording.
-
-    ropetrace track RECORDING --diameter 12mm --color '#c8281e' --out result.csv
-    """
-
-    source: OmitArgPrefixes[Source]
-    rope: OmitArgPrefixes[TrackedRope]
-    out: Annotated[tuple[Path, ...], arg(aliases=["-o"], metavar="FILE ...")] = ()
-    """Results: .csv, .parquet, .npz, .mcap or .rrd; several may be given."""
-    picture: Annotated[Path | None, arg(metavar="FILE")] = None
-    """A picture of six frames spread over the run, with the centreline drawn over them."""
-    mask: Annotated[Path | None, arg(metavar="FILE")] = None
-    """An image of the frames' size, white where the rope may be; replaces the colour."""
-    frame: Literal["camera", "world"] = "camera"
-    """The frame of the results; world needs camera_pose in the config."""
-    predict: Annotated[str | None, arg(metavar="now|DURATION")] = None
-    """Write the centreline of a later time than the frame's stamp: a duration such as 40ms, or now, the moment at which
-    the frame has been worked on; frames of a recording count as if they came at their stamps."""
-    view: bool = False
-    """Show it live in the Rerun viewer."""
-    overwrite: bool = False
-    """Replace results that exist."""
-
-    def run(self) -> int:
-        config = self.rope.settings(self.source.first_frames)
-        predict = _prediction(self.predict, config)
-        recording = self.source.open()
-        return _track(
-            recording,
-            config,
-            list(self.out),
-            predict=predict,
-            picture=self.picture,
-            start=self.source.part.start,
-            limit=self.source.part.limit,
-            mask=self.mask,
-            frame=self.frame,
-            view=self.view,
-            overwrite=self.overwrite,
-            inputs=[path for path in (self.rope.config, self.mask) if path is not None],
-        )
 
 
 @dataclass(frozen=True)
@@ -194,6 +147,7 @@ def main() -> None:
     command = tyro.cli(
         Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Track, tyro.conf.subcommand("track")]
+        | Annotated[Serve, tyro.conf.subcommand("serve")]
         | Annotated[Batch, tyro.conf.subcommand("batch")]
         | Annotated[Record, tyro.conf.subcommand("record")]
         | Annotated[Recover, tyro.conf.subcommand("recover")]
@@ -233,171 +187,6 @@ def main() -> None:
 def _interrupt(number: int, frame: object) -> None:
     INTERRUPTS.append(number)
     raise KeyboardInterrupt
-
-
-def _track(
-    recording: Recording,
-    config: RopeConfig,
-    outputs: list[Path],
-    *,
-    predict: float | Literal["now"] = 0.0,
-    picture: Path | None = None,
-    start: int = 0,
-    limit: int | None = None,
-    mask: Path | None = None,
-    frame: str = "camera",
-    view: bool = False,
-    overwrite: bool = False,
-    extra_sinks: list[Any] | None = None,
-    inputs: list[Path] | None = None,
-) -> int:
-    from ropetrace.live import LiveRecording
-    from ropetrace.motion import make_motion
-    from ropetrace.picture import ContactSheet
-    from ropetrace.recordings.base import has_color
-    from ropetrace.results import check_outputs, open_writer
-    from ropetrace.trackers import make_tracker
-    from ropetrace.tracking import track_recording
-
-    if frame == "world" and config.camera_pose is None:
-        raise ConfigError("--frame world needs camera_pose in the config")
-    if picture is not None and frame == "world":
-        raise ConfigError("--picture draws in the camera's frame: leave out --frame world")
-    live = recording if isinstance(recording, LiveRecording) else None
-    sources = [*([] if live else [recording.path]), *(inputs or [])]
-    check_outputs(outputs, overwrite, sources)
-    for path in [_settings_of(path) for path in outputs] + ([] if picture is None else [picture]):
-        if path.exists() and (not overwrite or any(path.samefile(source) for source in sources)):
-            raise OutputError(f"{path} exists already: choose another name or give --overwrite")
-    if config.asks_for_color and mask is None and not has_color(recording, start):
-        raise ConfigError("a colour is asked for, but the recording has none: leave out the colour, or record it")
-    tracker = make_tracker(config, None if mask is None else _mask(mask))
-    resolved = config.resolved().to_toml()
-    pose = config.world_from_camera() if frame == "world" else None
-    contact = None if picture is None else ContactSheet(picture)
-    with ExitStack() as stack:
-        sinks: list[Any] = [
-            stack.enter_context(
-                open_writer(
-                    path, overwrite=overwrite, frame_name=frame, metadata={"config": resolved}, frame_from_camera=pose
-                )
-            )
-            for path in outputs
-        ]
-        for path in outputs:
-            _write_config(_settings_of(path), resolved)
-        viewer = None
-        if view:
-            from ropetrace.results.live import LiveViewer
-
-            viewer = stack.enter_context(LiveViewer(frame_name=frame, frame_from_camera=pose))
-            sinks.append(viewer)
-        if contact is not None:
-            sinks.append(contact)
-        sinks += extra_sinks or []
-        if live is not None:
-            stack.callback(live.close)
-        total = None if recording.frame_count is None else max(recording.frame_count - start, 0)
-        if limit is not None:
-            total = limit if total is None else min(total, limit)
-        with _progress(total) as advance:
-            summary = track_recording(
-                recording.frames(start, limit),
-                tracker,
-                sinks,
-                motion=partial(make_motion, config.motion.method, config.diameter),
-                predict=predict,
-                first_index=start,
-                world_from_camera=pose,
-                wants_cloud=view or any(path.suffix.lower() == ".rrd" for path in outputs),
-                age=None if live is None else live.age,
-                on_frame=lambda estimate: advance(str(estimate.status)),
-                should_stop=lambda: bool(INTERRUPTS),
-            )
-    if contact is not None:
-        contact.save()
-    print("\n".join(summary.lines() + ([] if live is None else live.lines())))
-    for problem in recording.problems:
-        print(f"damage    {problem}")
-    for path in outputs:
-        print(f"written   {path} (settings: {path.name}.toml)")
-    if viewer is not None and viewer.skipped:
-        print(f"viewer    skipped {viewer.skipped} frames to keep up")
-    # A live source has no other end.
-    if summary.interrupted and live is None:
-        print("ropetrace: interrupted; what was tracked until then is written", file=sys.stderr)
-        return INTERRUPTED
-    if recording.problems:
-        print("ropetrace: part of the recording was lost (see damage above)", file=sys.stderr)
-        return DAMAGED
-    if not summary.frames:
-        print(f"ropetrace: there is no frame at or after --start {start}", file=sys.stderr)
-        return NOTHING_FOUND
-    if not summary.found:
-        print(
-            "ropetrace: no frame gave an estimate; `ropetrace doctor` with the same arguments says why",
-            file=sys.stderr,
-        )
-        return NOTHING_FOUND
-    return 0
-
-
-@contextmanager
-def _progress(total: int | None) -> Iterator[Any]:
-    """A bar of frames that is told of statuses."""
-    with progress_bar(total, "frame") as bar:
-
-        def advance(status: str) -> None:
-            bar.set_postfix_str(status, refresh=False)
-            bar.update()
-
-        yield advance
-
-
-LONGEST_PREDICTION = 1.0
-"""Seconds: further ahead no extrapolation of a rope's motion means anything."""
-
-
-def _prediction(text: str | None, config: RopeConfig) -> float | Literal["now"]:
-    """What --predict asks for, checked."""
-    if text is None:
-        return 0.0
-    if config.motion.method == "none":
-        raise ConfigError('--predict needs the motion of the rope: take motion.method = "none" out of the config')
-    if text == "now":
-        return "now"
-    try:
-        seconds = parse_duration(text)
-    except ConfigError as error:
-        raise ConfigError(f"--predict: {error}, or now") from None
-    if not 0 <= seconds <= LONGEST_PREDICTION:
-        raise ConfigError(f"--predict {text}: expected 0 to {LONGEST_PREDICTION:g} s")
-    return seconds
-
-
-def _settings_of(path: Path) -> Path:
-    """Where the settings of a result are kept."""
-    return path.with_name(path.name + ".toml")
-
-
-def _write_config(path: Path, text: str) -> None:
-    try:
-        path.write_text(f"# ropetrace {version('ropetrace')}, {time.strftime('%Y-%m-%d')}\n{text}", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
-
-
-def _mask(path: Path) -> Any:
-    import numpy as np
-    from PIL import Image
-
-    try:
-        if not path.is_file():
-            raise OSError("not a file")
-        with Image.open(path) as image:
-            return np.asarray(image.convert("L")) > 127
-    except (OSError, Image.DecompressionBombError) as error:
-        raise ConfigError(f"--mask {path}: cannot be read as an image: {error}") from None
 
 
 def _spread(recording: Recording, part: Part, count: int) -> Iterator[Any]:

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ropetrace.errors import import_extra
 from ropetrace.results.base import rope_name
-from ropetrace.types import Cloud, CloudFrame, Estimate, FloatArray, Frame, Motion, RgbdFrame, Status, Waypoints
+from ropetrace.types import Cloud, CloudFrame, Estimate, FloatArray, Frame, RgbdFrame, Status
+from ropetrace.viewer_shapes import (
+    NODE_COLORS,
+    ROPE_COLORS,
+    STATUS_COLORS,
+    ArmView,
+    arm_pictures,
+    axes_picture,
+    centerline_pictures,
+    rope_color,
+    velocity_picture,
+)
+
+__all__ = ["NO_METADATA", "ArmView", "RerunLog", "default_blueprint", "new_recording", "rope_entity"]
 
 rr: Any = import_extra("rerun", "viewer")
 rrb: Any = import_extra("rerun.blueprint", "viewer")
@@ -21,82 +32,36 @@ rrb: Any = import_extra("rerun.blueprint", "viewer")
 IMAGE_WIDTH = 640
 """Wider images are thinned to at most this many columns: they are looked at, not measured."""
 
-AXES = 12
-"""About how many waypoint frames, and velocities, are drawn; more would hide the rope."""
-
-VELOCITY_SECONDS = 0.1
-"""An arrow of a velocity is as long as the way of its waypoint in this time: 1 m/s is 0.1 m."""
-
-VELOCITY_COLOR = (255, 70, 255)
-
 SCENE_POINTS = 50_000
 """About how many points of a whole cloud are drawn."""
 
 CLOUD_POINTS = 3_000
 """About how many points of the rope are drawn: few enough to see the centreline among them."""
 
-STATUS_COLORS = {Status.OK: (60, 220, 90), Status.DEGRADED: (255, 170, 30), Status.LOST: (240, 70, 60)}
 STATUS_LEVELS = {Status.OK: "INFO", Status.DEGRADED: "WARN", Status.LOST: "ERROR"}
-
-NODE_COLORS = np.array(
-    [
-        (240, 96, 96),
-        (80, 170, 255),
-        (250, 200, 60),
-        (170, 110, 250),
-        (80, 220, 190),
-        (250, 120, 210),
-        (160, 210, 70),
-    ],
-    np.uint8,
-)
-"""Given in turn along the chain, so that the cuts between slices show."""
-
-ROPE_COLORS = NODE_COLORS[[4, 1, 2, 5, 3, 6, 0]]
-"""Of the centrelines of the first rope, the second, ..., in turn."""
-
-HIDDEN_PALER = 0.45
-"""How far the colour of a hidden part is moved towards white."""
-
-RING_CORNERS = 24
-
-ARM_COLOR = (200, 205, 210)
-TOOL_AXES = 0.08
-"""Length of the arrows that show the tool's frame, metres."""
-
-AXIS_COLORS = np.array([(255, 60, 60), (60, 200, 60), (70, 110, 255)], np.uint8)
 
 NO_NODE_COLOR = (110, 110, 110)
 
 NO_METADATA: Mapping[str, str] = MappingProxyType({})
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ArmView:
-    """An arm at a moment, in the frame of the estimates.
+LIVE_PICTURES = 15.0
+"""A live log has at most this many pictures a second, by the stamps; each costs a browser memory and time."""
 
-    Parameters
-    ----------
-    starts, ends : (K, 3) float array
-        Ends of the axes of the capsules that its links look like, metres.
-    radii : (K,) float array
-        Metres.
-    tool : (4, 4) float array
-        The tool's pose.
-    distance : float
-        From the tool to the rope, metres: plotted.
+LIVE_DEPTHS = 2.0
+"""Depth images and whole clouds: they are not compressed, and ten times as large as a colour image."""
+
+LIVE_STATUS_SECONDS = 5.0
+"""A live log repeats the status after so long, for those who come later."""
+
+
+def new_recording(flush_seconds: float | None = None) -> Any:
+    """A `rerun.RecordingStream` of its own, whose only clocks are the frame's index and its stamp.
+
+    What is logged in `flush_seconds`, if given, is sent on together.
     """
-
-    starts: FloatArray
-    ends: FloatArray
-    radii: FloatArray
-    tool: FloatArray
-    distance: float
-
-
-def new_recording() -> Any:
-    """A `rerun.RecordingStream` of its own, whose only clocks are the frame's index and its stamp."""
-    recording = rr.RecordingStream("ropetrace")
+    batches = None if flush_seconds is None else rr.ChunkBatcherConfig(flush_tick=flush_seconds)
+    recording = rr.RecordingStream("ropetrace", batcher_config=batches)
     recording.set_log_time_enabled(False)
     return recording
 
@@ -129,9 +94,9 @@ def default_blueprint(arm: bool = False) -> Any:
                     rrb.TimeSeriesView(name=last[0], origin=last[1]),
                 ),
                 rrb.TextLogView(name="Status", origin="/status"),
-                row_shares=[3, 1.5, 1],
+                row_shares=[4, 1.4, 1],
             ),
-            column_shares=[3, 2],
+            column_shares=[1, 1],
         ),
         rrb.TimePanel(state="collapsed", timeline="frame"),
         collapse_panels=True,
@@ -163,6 +128,9 @@ class RerunLog:
         shown but not placed in space.
     metadata : mapping of str to str
         Shown as texts under ``/metadata``.
+    live : bool
+        Log for people who look on, who come late, and must not be flooded: every estimate is in the plots, but there
+        are at most `LIVE_PICTURES` a second, and whoever missed the beginning misses nothing that matters.
     """
 
     def __init__(
@@ -172,8 +140,12 @@ class RerunLog:
         frame_name: str = "camera",
         frame_from_camera: FloatArray | None = None,
         metadata: Mapping[str, str] = NO_METADATA,
+        live: bool = False,
     ) -> None:
         self._recording = recording
+        self._live = live
+        self._shown_ns: dict[str, int] = {}
+        self._pictured = True
         self._pose = np.eye(4) if frame_name == "camera" else frame_from_camera
         self._camera: Any = None
         self._index: int | None = None
@@ -214,12 +186,15 @@ class RerunLog:
         self._recording.set_time("time", timestamp=np.datetime64(estimate.stamp_ns, "ns"))
         if index != self._index:
             self._index = index
-            self._log_images(frame)
-            self._log_scene(frame)
-            for rope in {0, *self._reported}:
-                self._recording.log(rope_entity(rope), rr.Clear(recursive=True))
-            self._log_cloud(cloud)
-        self._log_rope(estimate)
+            self._pictured = self._is_due("picture", estimate.stamp_ns, 1 / LIVE_PICTURES)
+            if self._pictured:
+                self._log_images(frame)
+                self._log_scene(frame)
+                for rope in {0, *self._reported}:
+                    self._recording.log(rope_entity(rope), rr.Clear(recursive=True))
+                self._log_cloud(cloud)
+        if self._pictured:
+            self._log_rope(estimate)
         self._log_plots(estimate)
         self._log_status(estimate)
         if arm is not None:
@@ -233,12 +208,21 @@ class RerunLog:
             return
         step = -(-frame.intrinsics.width // IMAGE_WIDTH)
         self._log_camera(frame, step)
-        depth = rr.DepthImage(frame.depth[::step, ::step], meter=1 / frame.depth_unit_m, colormap="Viridis")
-        if frame.color is None:
-            self._recording.log("camera/image", depth)
-        else:
+        if frame.color is not None:
             self._recording.log("camera/image", rr.Image(frame.color[::step, ::step]).compress(jpeg_quality=80))
-            self._recording.log("camera/depth", depth)
+        if self._is_due("depth", frame.stamp_ns, 1 / LIVE_DEPTHS):
+            depth = rr.DepthImage(frame.depth[::step, ::step], meter=1 / frame.depth_unit_m, colormap="Viridis")
+            self._recording.log("camera/image" if frame.color is None else "camera/depth", depth)
+
+    def _is_due(self, what: str, stamp_ns: int, seconds: float) -> bool:
+        """Whether something may be shown again; in a live log, so long after the last time."""
+        if self._live:
+            since = stamp_ns - self._shown_ns.get(what, stamp_ns)
+            # A tenth is left to jitter: every second frame of 30 Hz makes 15. Stamps may run back.
+            if what in self._shown_ns and 0 <= since < 0.9e9 * seconds:
+                return False
+            self._shown_ns[what] = stamp_ns
+        return True
 
     def _log_camera(self, frame: RgbdFrame, step: int) -> None:
         camera = frame.intrinsics
@@ -258,10 +242,12 @@ class RerunLog:
                 camera_xyz=rr.ViewCoordinates.RDF,
                 image_plane_distance=0.1,
             ),
+            # What is static is never dropped. In a file, the frames before a change keep their camera.
+            static=self._live,
         )
 
     def _log_scene(self, frame: Frame | None) -> None:
-        if not isinstance(frame, CloudFrame):
+        if not isinstance(frame, CloudFrame) or not self._is_due("depth", frame.stamp_ns, 1 / LIVE_DEPTHS):
             return
         step = -(-len(frame.points) // SCENE_POINTS) or 1
         colors = NO_NODE_COLOR if frame.colors is None else frame.colors[::step]
@@ -286,39 +272,15 @@ class RerunLog:
             )
         if not len(estimate.waypoints):
             return
-        for name, picture in _centerline(estimate).items():
+        for name, picture in centerline_pictures(estimate).items():
             self._recording.log(f"{entity}/{name}", picture)
-        self._recording.log(f"{entity}/axes", _axes(estimate.waypoints))
+        self._recording.log(f"{entity}/axes", axes_picture(estimate.waypoints))
         if estimate.motion is not None:
-            self._recording.log(f"{entity}/velocity", _velocity(estimate.waypoints, estimate.motion))
+            self._recording.log(f"{entity}/velocity", velocity_picture(estimate.waypoints, estimate.motion))
 
     def _log_arm(self, arm: ArmView) -> None:
-        along = arm.ends - arm.starts
-        lengths = np.linalg.norm(along, axis=1)
-        # Rerun's capsules stand on z; the shortest turn from there has half the angle in this unnormalised quaternion.
-        x, y, z = (along / np.maximum(lengths, 1e-9)[:, None]).T
-        turns = np.stack([-y, x, np.zeros(len(x)), 1 + z], axis=1)
-        turns[1 + z < 1e-6] = (1.0, 0.0, 0.0, 0.0)
-        self._recording.log(
-            "arm/links",
-            rr.Capsules3D(
-                lengths=lengths,
-                radii=arm.radii,
-                translations=arm.starts,
-                quaternions=turns / np.linalg.norm(turns, axis=1, keepdims=True),
-                colors=ARM_COLOR,
-                fill_mode="solid",
-            ),
-        )
-        self._recording.log(
-            "arm/tool",
-            rr.Arrows3D(
-                origins=np.tile(arm.tool[:3, 3], (3, 1)),
-                vectors=TOOL_AXES * arm.tool[:3, :3].T,
-                colors=AXIS_COLORS,
-                radii=rr.Radius.ui_points(2.0),
-            ),
-        )
+        for name, picture in arm_pictures(arm).items():
+            self._recording.log(f"arm/{name}", picture)
         self._recording.log("plots/tool_distance", rr.Scalars(arm.distance))
 
     def _log_plots(self, estimate: Estimate) -> None:
@@ -334,9 +296,14 @@ class RerunLog:
 
     def _log_status(self, estimate: Estimate) -> None:
         rope = estimate.rope
-        if self._reported.get(rope) == (estimate.status, estimate.reasons):
+        told = (estimate.status, estimate.reasons)
+        if self._live:
+            # How much is hidden, and for how long, changes from frame to frame: that is no news.
+            told = (estimate.status, tuple(re.sub(r"[\d.]+", "#", reason) for reason in estimate.reasons))
+        repeated = self._live and self._is_due(f"status {rope}", estimate.stamp_ns, LIVE_STATUS_SECONDS)
+        if self._reported.get(rope) == told and not repeated:
             return
-        self._reported[rope] = (estimate.status, estimate.reasons)
+        self._reported[rope] = told
         name = f"rope {rope}" if rope else ""
         text = ": ".join(filter(None, (name, str(estimate.status), "; ".join(estimate.reasons))))
         self._recording.log(
@@ -348,83 +315,6 @@ class RerunLog:
 def _with_rope(entity: str, rope: int) -> str:
     """Where a rope's part of what all ropes have is: the first one's is the entity itself."""
     return entity if rope == 0 else f"{entity}/{rope_name(rope)}"
-
-
-def rope_color(rope: int) -> NDArray[np.uint8]:
-    """The colour of a rope's centreline."""
-    return np.asarray(ROPE_COLORS[rope % len(ROPE_COLORS)])
-
-
-def _centerline(estimate: Estimate) -> dict[str, Any]:
-    """The centreline's pictures by name: its seen and hidden parts, the rings, and its name where it starts."""
-    waypoints = estimate.waypoints
-    points, color = waypoints.positions, rope_color(estimate.rope)
-    pale = (color + HIDDEN_PALER * (255 - color)).astype(np.uint8)
-    seen = np.ones(len(points), bool) if estimate.seen is None else estimate.seen
-    seen_steps = seen[:-1] & seen[1:]
-    name = f"rope {estimate.rope}"
-    pictures = {
-        "name": rr.Points3D(
-            points[:1],
-            labels=[name if estimate.status is Status.OK else f"{name}: {estimate.status}"],
-            colors=STATUS_COLORS[estimate.status],
-            radii=rr.Radius.ui_points(3.0),
-            show_labels=True,
-        )
-    }
-    for part, steps, shade, width in (("centerline", seen_steps, color, 1.75), ("hidden", ~seen_steps, pale, 1.0)):
-        if steps.any():
-            pictures[part] = rr.LineStrips3D(_strips(points, steps), colors=shade, radii=rr.Radius.ui_points(width))
-    ringed = seen if estimate.seen is None else ~seen
-    if estimate.position_sigma is not None and ringed.any():
-        rings = _rings(waypoints, estimate.position_sigma, ringed)
-        pictures["sigma"] = rr.LineStrips3D(rings, colors=pale, radii=rr.Radius.ui_points(0.5))
-    return pictures
-
-
-def _strips(points: FloatArray, chosen: NDArray[np.bool_]) -> list[FloatArray]:
-    """The parts of a line of W points whose segments, (W - 1,), are chosen."""
-    bounds = np.flatnonzero(np.diff(chosen, prepend=False, append=False))
-    return [points[start : end + 1] for start, end in bounds.reshape(-1, 2)]
-
-
-def _rings(waypoints: Waypoints, radii: FloatArray, chosen: NDArray[np.bool_]) -> FloatArray:
-    """Closed circles of the radii round the rope at the K chosen of W waypoints, (K, corners, 3)."""
-    angle = np.linspace(0, 2 * np.pi, RING_CORNERS + 1)
-    circle = np.column_stack((np.zeros_like(angle), np.cos(angle), np.sin(angle)))
-    turns = Rotation.from_quat(waypoints.quaternions[chosen]).as_matrix()
-    return waypoints.positions[chosen, None] + radii[chosen, None, None] * (circle @ turns.transpose(0, 2, 1))
-
-
-def _step(waypoints: Waypoints) -> int:
-    """Which waypoints get arrows: every so many."""
-    return -(-len(waypoints) // AXES)
-
-
-def _axes(waypoints: Waypoints) -> Any:
-    """Arrows for the frames of about `AXES` waypoints: X (along the rope) red, Y green, Z blue."""
-    step = _step(waypoints)
-    positions = waypoints.positions[::step]
-    size = max(0.6 * waypoints.length / AXES, 0.002)
-    # The columns of a rotation matrix are the frame's axes.
-    axes = size * Rotation.from_quat(waypoints.quaternions[::step]).as_matrix().transpose(0, 2, 1)
-    return rr.Arrows3D(
-        origins=np.repeat(positions, 3, axis=0),
-        vectors=axes.reshape(-1, 3),
-        colors=np.tile(AXIS_COLORS, (len(positions), 1)),
-        radii=rr.Radius.ui_points(1.5),
-    )
-
-
-def _velocity(waypoints: Waypoints, motion: Motion) -> Any:
-    """Arrows for the velocities of about `AXES` waypoints."""
-    step = _step(waypoints)
-    return rr.Arrows3D(
-        origins=waypoints.positions[::step],
-        vectors=VELOCITY_SECONDS * motion.velocities[::step],
-        colors=VELOCITY_COLOR,
-        radii=rr.Radius.ui_points(2.0),
-    )
 
 
 def _speed(estimate: Estimate) -> Any:
