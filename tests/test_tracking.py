@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from helpers import RED_TEXT, SHAPES, SMALL, random_rotation, seen
+from ropetrace import tracking
 from ropetrace.config import RopeConfig
 from ropetrace.errors import FrameError, OutputError
 from ropetrace.motion.arc_length import ArcLengthMotion
@@ -438,3 +439,14 @@ def test_the_summary_tells_lengths_and_times() -> None:
     text = "\n".join(run([good(1), good(2)], Keeper()).lines())
     for word in ("2 ok", "points    ", "nodes     ", "length    0.6", "segmentation", "p99 ms", "write"):
         assert word in text
+
+
+def test_a_run_without_an_end_keeps_the_figures_of_its_last_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tracking, "MOST_KEPT", 3)
+    summary = run([good(stamp) for stamp in range(1, 6)])
+    assert summary.frames == summary.found == summary.ropes[0].statuses[Status.OK] == 5
+    kept = [*summary.stage_seconds.values(), summary.ropes[0].lengths, summary.ropes[0].nodes]
+    assert {len(figures) for figures in kept} == {3}
+    text = "\n".join(summary.lines())
+    assert "are of the last 3 frames" in text
+    assert "first two frames" not in text

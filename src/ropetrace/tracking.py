@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -34,15 +34,23 @@ class RopesTracker(Tracker, Protocol):
         """As `update`, with an estimate for each rope: at least one, in the order of their `rope`."""
 
 
+MOST_KEPT = 100_000
+"""Figures of each kind that a summary keeps: those of the last hour at 30 frames a second, since some runs last."""
+
+
+def _figures() -> deque[float]:
+    return deque(maxlen=MOST_KEPT)
+
+
 @dataclass(slots=True)
 class RopeSummary:
     """What a run came to for one rope."""
 
     statuses: Counter[Status] = field(default_factory=Counter)
     reasons: Counter[str] = field(default_factory=Counter)
-    points: list[int] = field(default_factory=list)
-    nodes: list[int] = field(default_factory=list)
-    lengths: list[float] = field(default_factory=list)
+    points: deque[float] = field(default_factory=_figures)
+    nodes: deque[float] = field(default_factory=_figures)
+    lengths: deque[float] = field(default_factory=_figures)
 
     def add(self, estimate: Estimate) -> None:
         """Count one estimate."""
@@ -52,6 +60,11 @@ class RopeSummary:
             self.points.append(estimate.point_count)
             self.nodes.append(len(estimate.nodes))
             self.lengths.append(estimate.waypoints.length)
+
+    @property
+    def found(self) -> int:
+        """Estimates that are not lost."""
+        return self.statuses.total() - self.statuses[Status.LOST]
 
     @property
     def counts(self) -> str:
@@ -77,8 +90,8 @@ class Summary:
 
     frames: int = 0
     ropes: dict[int, RopeSummary] = field(default_factory=lambda: defaultdict(RopeSummary))
-    stage_seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    latency_seconds: list[float] = field(default_factory=list)
+    stage_seconds: dict[str, deque[float]] = field(default_factory=lambda: defaultdict(_figures))
+    latency_seconds: deque[float] = field(default_factory=_figures)
     interrupted: bool = False
 
     def add(self, *estimates: Estimate) -> None:
@@ -90,7 +103,7 @@ class Summary:
     @property
     def found(self) -> int:
         """Estimates that are not lost, of all ropes."""
-        return sum(len(rope.nodes) for rope in self.ropes.values())
+        return sum(rope.found for rope in self.ropes.values())
 
     def lines(self) -> list[str]:
         """The summary for people."""
@@ -101,20 +114,24 @@ class Summary:
         else:
             rope = next(iter(self.ropes.values()), RopeSummary())
             lines = [f"frames    {self.frames} ({rope.counts})", *rope.lines()]
+        if self.frames > MOST_KEPT:
+            lines.append(f"          sizes, times and latency are of the last {MOST_KEPT} frames")
         if self.stage_seconds:
             lines.append("time      stage            p50 ms   p99 ms")
             first = 0.0
             for stage, seconds in self.stage_seconds.items():
                 # The first two frames wait for the compiler, or for its cache: they are not like the others.
-                rest = seconds[2:] or seconds
-                first += sum(seconds[:2])
-                p50, p99 = np.percentile(np.array(rest) * 1e3, [50, 99])
+                kept = list(seconds)
+                first += sum(kept[:2])
+                p50, p99 = np.percentile(np.array(kept[2:] or kept) * 1e3, [50, 99])
                 lines.append(f"          {stage:14s} {p50:8.3f} {p99:8.3f}")
-            lines.append(
-                f"          without the first two frames, which took {first:.2f} s with the start of the kernels"
-            )
+            if self.frames <= MOST_KEPT:
+                lines.append(
+                    f"          without the first two frames, which took {first:.2f} s with the start of the kernels"
+                )
         if self.latency_seconds:
-            p50, p99 = np.percentile(np.array(self.latency_seconds[2:] or self.latency_seconds) * 1e3, [50, 99])
+            kept = list(self.latency_seconds)
+            p50, p99 = np.percentile(np.array(kept[2:] or kept) * 1e3, [50, 99])
             lines.append(f"latency   from the stamp to the estimate: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
         return lines
 
@@ -305,7 +322,7 @@ def estimates_of(event: Event, tracker: Tracker, ropes: list[int], lap: Lap = no
 class _Stopwatch:
     """Adds the time since the last lap to a stage's list; a stage without a name is not kept."""
 
-    def __init__(self, stages: dict[str, list[float]]) -> None:
+    def __init__(self, stages: dict[str, deque[float]]) -> None:
         self._stages = stages
         self._since = time.perf_counter()
 
