@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ pytest.importorskip("zenoh")
 pytest.importorskip("mujoco")
 pytest.importorskip("pinocchio")
 
-from ropetrace.cli_node import Images, Joints, Reach, Router
+from ropetrace.cli_node import Commands, Images, Reach, Robot, Router
 from ropetrace.errors import ConfigError
 from ropetrace.recordings.ros_messages import RawMessage, decoded
 from ropetrace.results.ros_estimates import PATH, TRAJECTORY
@@ -28,7 +29,7 @@ from ropetrace.ros.messages import JOINTS, NUMBERS
 from ropetrace.ros.simulated_cell import cell_config
 from ropetrace.ros.zenoh_graph import ZenohNode
 from ropetrace.ros.zenoh_session import Connection
-from ros_rig import free_endpoint, until
+from ros_rig import children_of, free_endpoint, runs, until
 
 STARTED = 60.0
 """A node with its kernels is up within this, seconds: the machine may be busy."""
@@ -142,13 +143,49 @@ def test_all_starts_the_graph_and_ctrl_c_ends_it(tmp_path: Path) -> None:
     finally:
         process.kill()
         process.wait()
-    assert not [child for child in children if os.path.exists(f"/proc/{child}")]
+    assert not any(runs(child) for child in children)
     assert "Traceback" not in log.read_text(), log.read_text()
 
 
-def children_of(pid: int) -> list[int]:
-    with open(f"/proc/{pid}/task/{pid}/children", encoding="ascii") as file:
-        return [int(child) for child in file.read().split()]
+def test_no_node_outlives_all_even_if_that_is_killed(tmp_path: Path) -> None:
+    """Some run by then, others are still starting."""
+    command = [sys.executable, "-m", "ropetrace", "node", "all", "--simulate", "--router", free_endpoint()]
+    log = tmp_path / "log.txt"
+    with log.open("wb") as out:
+        process = subprocess.Popen(command, stderr=out)
+    try:
+        until(lambda: "router: listening" in log.read_text(), STARTED)
+        children = children_of(process.pid)
+        assert len(children) == 5
+    finally:
+        process.kill()
+        process.wait()
+    until(lambda: not any(runs(child) for child in children))
+
+
+def test_a_node_whose_supervisor_is_gone_before_it_starts_ends() -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as gone:
+        gone.wait()
+    command = [sys.executable, "-m", "ropetrace", "node", "router", "--router", free_endpoint()]
+    result = subprocess.run(command, env={**os.environ, "ROPETRACE_SUPERVISOR": str(gone.pid)}, timeout=60, check=False)
+    assert result.returncode == 143
+
+
+def test_the_way_to_ros(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("ROS_MASTER_URI", raising=False)
+    if find_spec("rclpy") or find_spec("rospy"):
+        pytest.skip("a ROS is installed for this Python")
+    assert Reach().way() == "zenoh"
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "rospy.py").touch()
+    assert Reach().way() == "zenoh"
+    monkeypatch.setenv("ROS_MASTER_URI", "http://localhost:11311")
+    assert Reach().way() == "rospy"
+    assert Reach(domain=3).way() == "zenoh", "what is said of Zenoh alone says Zenoh"
+    assert Reach("zenoh", mode="client").way() == "zenoh"
+    (tmp_path / "rclpy.py").touch()
+    assert Reach().way() == "rclpy"
+    assert Reach("rospy").way() == "rospy"
 
 
 def test_the_command_line_has_the_defaults_of_the_nodes() -> None:
@@ -156,7 +193,7 @@ def test_the_command_line_has_the_defaults_of_the_nodes() -> None:
     assert CameraTopics() == CameraTopics(
         images.depth_topic, images.color_topic, images.camera_topic, images.cloud_topic
     )
-    assert ArmSettings() == ArmSettings(**asdict(Joints()))
+    assert ArmSettings() == ArmSettings(**asdict(Robot()), **asdict(Commands()))
     reach = Reach()
     assert Connection() == Connection(reach.router, reach.mode, reach.listen, reach.multicast, 0, reach.humble)
     assert Router().router == reach.router
@@ -173,13 +210,20 @@ def test_a_domain_of_the_environment_that_is_none(monkeypatch: pytest.MonkeyPatc
     [
         (["kinematic_system", "--diameter", "15mm"], "camera_pose"),
         (["all", "--diameter", "15mm"], "camera_pose"),
+        (["track_deformable", "--diameter", "15mm", "--self-filter"], "--self-filter needs camera_pose"),
         (["track_deformable"], "diameter is missing"),
         (["track_deformable", "--diameter", "15mm", "--depth-topic", "depth"], "no full name of a topic"),
         (["trajectory_tracker", "--diameter", "15mm", "--domain", "999"], "0 to 232"),
         (["router", "--router", "tcp/203.0.113.1:7447"], "no Zenoh session"),
+        (["sim", "--ros", "rospy", "--router", "tcp/127.0.0.1:1"], "--router is for --ros zenoh alone"),
+        (["sim", "--ros", "rclpy", "--multicast"], "--multicast is for --ros zenoh alone"),
+        (["all", "--simulate", "--ros", "rclpy", "--domain", "3"], "rclpy takes ROS_DOMAIN_ID"),
+        (["sim", "--ros", "rospy"], "this needs rospy of ROS 1"),
     ],
 )
 def test_what_is_wrong_is_one_line(told: list[str], said: str) -> None:
+    if "this needs rospy" in said and find_spec("rospy"):
+        pytest.skip("rospy is installed for this Python")
     result = subprocess.run(
         [sys.executable, "-m", "ropetrace", "node", *told], capture_output=True, text=True, timeout=60, check=False
     )

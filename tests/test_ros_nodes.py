@@ -28,7 +28,7 @@ from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, heade
 from ropetrace.ros import messages
 from ropetrace.ros.graph import Publisher, Subscription
 from ropetrace.ros.kinematic_system import ArmSettings, KinematicSystem, ReceivedMotion, position_at
-from ropetrace.ros.live_camera import CameraTopics
+from ropetrace.ros.live_camera import CameraTopics, LiveCamera
 from ropetrace.ros.messages import JOINTS, NUMBERS, POSES, TIME
 from ropetrace.ros.robot_filter import RobotFilter
 from ropetrace.ros.simulated_cell import ARM_AWAY, CellSettings, SimulatedCell, cell_config
@@ -445,6 +445,24 @@ def test_joints_are_carried_on_from_their_stamp(age: float, velocity: float | No
     state = messages.joint_state(header(round((now - age) * 1e9), ""), PANDA.joint_names, START, moving)
     message = RawMessage("/joint_states", JOINTS, "cdr", 0, bytes(typestore().serialize_cdr(state, JOINTS)))
     np.testing.assert_allclose(position_at(now, message, PANDA.joint_names) - START, carried, atol=1e-6)
+
+
+@pytest.mark.parametrize("in_order", [False, True])
+def test_the_newest_frame_or_every_one(scene: tuple[RgbdFrame, FloatArray], in_order: bool) -> None:
+    with graph() as (node, beside):
+        camera, sender = LiveCamera(node, CameraTopics(), True, in_order=in_order), Sender(beside)
+        until(lambda: sender.send(scene[0]) or camera.take() is not None)
+        time.sleep(0.1)
+        while camera.take() is not None:
+            """Those of the beginning."""
+        for _ in range(3):
+            sender.send(scene[0])
+        time.sleep(0.2)
+        taken = []
+        while (seen := camera.take()) is not None:
+            taken.append(seen.event.stamp_ns)
+        assert len(taken) == (3 if in_order else 1)
+        assert sorted(taken) == taken
 
 
 def test_the_arm_is_taken_out_of_the_image() -> None:

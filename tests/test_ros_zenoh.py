@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("zenoh")
+pytest.importorskip("xxhash")
 
 import zenoh
 from rosbags.typesys import Stores, get_typestore
@@ -30,13 +31,14 @@ from ropetrace.ros.zenoh_graph import (
     attachment,
     dds_type,
     node_token,
+    publisher_id,
     ros_type,
     topic_key,
     topic_token,
     type_hash,
 )
 from ropetrace.ros.zenoh_session import Connection, open_session
-from ros_rig import free_endpoint, routed, until
+from ros_rig import free_endpoint, listening, routed, until
 
 STRING = "std_msgs/msg/String"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -84,6 +86,13 @@ def test_the_attachment_is_what_zenohs_own_serializer_makes() -> None:
     # rmw_zenoh serializes an int64, an int64 and 16 bytes, one after the other (attachment_helpers.cpp).
     assert attachment(7, 10**18, gid) == z_serialize((Int64(7), Int64(10**18), gid)).to_bytes()
     assert len(attachment(7, 10**18, gid)) == 33
+
+
+def test_a_publishers_id_is_xxh3_of_its_token_as_rmw_zenoh_lays_it_out() -> None:
+    # XXH3-128 of nothing is 99aa06d3014798d8 6001c324468d497f, as its authors have it; liveliness_utils.cpp copies the
+    # lower half first, each in the order of a little-endian machine.
+    low, high = 0x6001C324468D497F, 0x99AA06D3014798D8
+    assert publisher_id("") == struct.pack("<QQ", low, high)
 
 
 def test_our_types_are_the_same_in_all_distributions() -> None:
@@ -136,11 +145,12 @@ def test_a_raw_peer_sees_the_node_its_topics_and_its_messages(humble: bool) -> N
         assert sequence >= 1
         assert abs(stamp - time.time_ns()) < 60e9
         assert size == 16
+        published = next(token for _, token in tokens if "/MP/" in token)
+        assert first.attachment.to_bytes()[17:] == publisher_id(published)
         kinds = sorted(token.split("/")[5] for _, token in tokens)
         assert kinds == ["MP", "MS", "NN"]
         for _, token in tokens:
             assert token.split("/")[1:4] == ["3", tokens[0][1].split("/")[2], "0"]
-        published = next(token for _, token in tokens if "/MP/" in token)
         assert published.split("/")[6:12] == ["%", "%", "talker", "%chatter", "std_msgs::msg::dds_::String_", hashed]
         node.close()
         until(lambda: sum(kind == "DELETE" for kind, _ in tokens) == 3)
@@ -258,33 +268,6 @@ def test_nothing_listens_beyond_loopback(mode: Any) -> None:
     assert {host for _, host in heard} <= {"127.0.0.1"}
     assert [kind for kind, _ in heard] == (["tcp"] if mode == "peer" else [])
     assert {host for _, host in listening(os.getpid())} <= {"127.0.0.1"}, "the router"
-
-
-def listening(pid: int) -> list[tuple[str, str]]:
-    """Protocol and address of every socket of a process that takes connections or datagrams."""
-    inodes = set()
-    for entry in os.scandir(f"/proc/{pid}/fd"):
-        try:
-            link = os.readlink(entry.path)
-        except OSError:
-            continue
-        if link.startswith("socket:["):
-            inodes.add(link[8:-1])
-    found = []
-    for table in ("tcp", "tcp6", "udp", "udp6"):
-        with open(f"/proc/{pid}/net/{table}", encoding="ascii") as rows:
-            next(rows)
-            for row in rows:
-                cells = row.split()
-                if cells[9] in inodes and (cells[3] == "0A" or table.startswith("udp")):
-                    address = cells[1].rpartition(":")[0]
-                    host = (
-                        ".".join(str(byte) for byte in reversed(bytes.fromhex(address)))
-                        if len(address) == 8
-                        else address
-                    )
-                    found.append((table.rstrip("6"), host))
-    return found
 
 
 @pytest.mark.parametrize("name", ["chatter", "/", "//a", "/a b", "/a/", "/1", "/a*", ""])

@@ -1,14 +1,10 @@
-"""The command that starts nodes of live ROS 2: words for people, no logic."""
+"""The command that starts nodes of live ROS: words for people, no logic."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
-import signal
-import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -21,25 +17,23 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, arg
 
 from ropetrace.cli_source import Rope
 from ropetrace.errors import ConfigError, OutputError, import_extra
-from ropetrace.terminal import BAD_INPUT
+from ropetrace.ros.joining import Way, best_way, domain_of_environment
+from ropetrace.ros.supervise import end_with_supervisor, supervise, told_to_stop
 
 if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
     from ropetrace.ros.graph import RosNode
-
-RESTART_AFTER = 1.0
-"""Seconds."""
-
-LONGEST_END = 10.0
-"""A node that has not ended by itself after this long is killed, seconds."""
 
 
 @dataclass(frozen=True)
 class Reach:
     """How the ROS graph is reached."""
 
+    ros: Literal["auto", Way] = "auto"
+    """zenoh: ROS 2 without an installation; rclpy: an installed ROS 2; rospy: ROS 1. auto: rclpy where it can be
+    imported; else rospy, where it can be and ROS_MASTER_URI is set; else zenoh."""
     router: Annotated[str, arg(metavar="ENDPOINT")] = "tcp/127.0.0.1:7447"
-    """The Zenoh router: `ropetrace node router`, or rmw_zenohd of ROS."""
+    """The Zenoh router: `ropetrace node router`, or rmw_zenohd of ROS. This and the following are for zenoh alone."""
     mode: Literal["peer", "client"] = "peer"
     """peer: data goes straight from node to node, as rmw_zenoh does it; client: through the router."""
     listen: Annotated[str, arg(metavar="ENDPOINT")] = "tcp/127.0.0.1:0"
@@ -51,20 +45,43 @@ class Reach:
     humble: bool = False
     """Speak with ROS 2 Humble, in the place of Jazzy, Kilted and Lyrical."""
 
-    def node(self, name: str) -> RosNode:
-        """Join the graph; says so if there is no router."""
-        from ropetrace.ros.zenoh_graph import ZenohNode
-        from ropetrace.ros.zenoh_session import Connection, router_answers
+    def way(self) -> Way:
+        """What `ros` comes to here.
 
-        domain = self.domain if self.domain is not None else _domain_of_environment()
+        Raises
+        ------
+        ConfigError
+            If there are options that only another way has.
+        """
+        given = [item.name for item in dataclasses.fields(self)[1:] if getattr(self, item.name) != item.default]
+        if self.ros == "auto":
+            return "zenoh" if given else best_way()
+        if given and self.ros != "zenoh":
+            told = {"rclpy": "rclpy takes ROS_DOMAIN_ID and RMW_IMPLEMENTATION", "rospy": "rospy takes ROS_MASTER_URI"}
+            raise ConfigError(f"--{given[0]} is for --ros zenoh alone, not for --ros {self.ros}: {told[self.ros]}")
+        return self.ros
+
+    def node(self, name: str) -> RosNode:
+        """Join the graph; says so if there is no router, or no roscore."""
+        way = self.way()
+        if way == "rclpy":
+            from ropetrace.ros.rclpy_graph import RclpyNode
+
+            return RclpyNode(name)
+        if way == "rospy":
+            from ropetrace.ros.rospy_graph import RospyNode
+
+            return RospyNode(name)
+        return self._zenoh_node(name)
+
+    def _zenoh_node(self, name: str) -> RosNode:
+        from ropetrace.ros.zenoh_graph import ZenohNode
+        from ropetrace.ros.zenoh_session import START_ROUTER, Connection, router_answers
+
+        domain = self.domain if self.domain is not None else domain_of_environment()
         connection = Connection(self.router, self.mode, self.listen, self.multicast, domain, self.humble)
         if not router_answers(self.router):
-            print(
-                f"{name}: no router at {self.router} yet: start one with `ropetrace node router`, "
-                "or `ros2 run rmw_zenoh_cpp rmw_zenohd`",
-                file=sys.stderr,
-                flush=True,
-            )
+            print(f"{name}: no router at {self.router} yet: {START_ROUTER}", file=sys.stderr, flush=True)
         return ZenohNode(name, connection)
 
 
@@ -83,15 +100,25 @@ class Images:
 
 
 @dataclass(frozen=True)
-class Joints:
+class Robot:
     """The arm."""
 
     arm: str = "panda"
     """One that comes with ropetrace: panda or fr3."""
-    rate: Annotated[float, arg(metavar="HZ")] = 100.0
-    """Commands in a second."""
     joint_topic: Annotated[str, arg(metavar="TOPIC")] = "/joint_states"
     """sensor_msgs/JointState: where the joints are."""
+
+
+@dataclass(frozen=True)
+class Commands:
+    """What the arm is told."""
+
+    rate: Annotated[float, arg(metavar="HZ")] = 100.0
+    """Commands in a second."""
+    response: Annotated[float, arg(metavar="SECONDS")] = 0.0
+    """From a command's arrival until the joints move at its velocity."""
+    tool_turn: Annotated[float, arg(metavar="RAD/S")] = 2.5
+    """Greatest angular speed of the tool."""
     command_topic: Annotated[str, arg(metavar="TOPIC")] = "/ropetrace/velocity_commands"
     """std_msgs/Float64MultiArray: how fast they are to be, as ros2_control takes it."""
 
@@ -102,16 +129,30 @@ class TrackDeformable:
 
     rope: OmitArgPrefixes[Rope]
     images: OmitArgPrefixes[Images]
+    robot: OmitArgPrefixes[Robot]
     reach: OmitArgPrefixes[Reach]
+    self_filter: bool = False
+    """Take the arm out of the images, by where its joints are; the settings must have camera_pose."""
 
     def run(self) -> int:
-        from ropetrace.ros import track_deformable
         from ropetrace.ros.live_camera import CameraTopics
+        from ropetrace.ros.track_deformable import TrackDeformable
 
-        images = self.images
+        images, robot = self.images, self.robot
         config = self.rope.settings()
         topics = CameraTopics(images.depth_topic, images.color_topic, images.camera_topic, images.cloud_topic)
-        return _run(self.reach, "track_deformable", lambda node: track_deformable.TrackDeformable(node, config, topics))
+        if not self.self_filter:
+            return _run(self.reach, "track_deformable", lambda node: TrackDeformable(node, config, topics))
+        _check_camera_pose(config, "--self-filter")
+        from ropetrace.control.arm import Arm
+        from ropetrace.ros.robot_filter import RobotFilter
+
+        arm, pose = Arm.named(robot.arm), config.world_from_camera()
+
+        def make(node: RosNode) -> TrackDeformable:
+            return TrackDeformable(node, config, topics, RobotFilter(node, arm, robot.joint_topic, pose))
+
+        return _run(self.reach, "track_deformable", make)
 
 
 @dataclass(frozen=True)
@@ -136,15 +177,16 @@ class KinematicSystem:
     """
 
     rope: OmitArgPrefixes[Rope]
-    joints: OmitArgPrefixes[Joints]
+    robot: OmitArgPrefixes[Robot]
+    commands: OmitArgPrefixes[Commands]
     reach: OmitArgPrefixes[Reach]
 
     def run(self) -> int:
         from ropetrace.ros import kinematic_system
 
         config = self.rope.settings()
-        _check_camera_pose(config)
-        settings = kinematic_system.ArmSettings(**dataclasses.asdict(self.joints))
+        _check_camera_pose(config, "kinematic_system")
+        settings = kinematic_system.ArmSettings(**dataclasses.asdict(self.robot), **dataclasses.asdict(self.commands))
         pose = config.world_from_camera()
         return _run(self.reach, "kinematic_system", lambda node: kinematic_system.KinematicSystem(node, pose, settings))
 
@@ -156,6 +198,8 @@ class Sim:
     reach: OmitArgPrefixes[Reach]
     wind: Annotated[float, arg(metavar="HZ")] = 0.0
     """How often the wind turns in a second; 0.8 is the rope's resonance, 0 no wind."""
+    condition: Literal["30fps", "60fps"] = "30fps"
+    """The camera: 480x360 at 30 frames a second, or 1280x720 at 60."""
     settings: Annotated[Path | None, arg(metavar="FILE")] = None
     """Write the settings for the other nodes, for their --config."""
 
@@ -164,7 +208,8 @@ class Sim:
 
         if self.settings is not None:
             _write_settings(self.settings, cell_config())
-        return _run(self.reach, "ropetrace_sim", lambda node: SimulatedCell(node, CellSettings(self.wind)))
+        settings = CellSettings(self.wind, condition=self.condition)
+        return _run(self.reach, "ropetrace_sim", lambda node: SimulatedCell(node, settings))
 
 
 @dataclass(frozen=True)
@@ -177,7 +222,7 @@ class Router:
     def run(self) -> int:
         from ropetrace.ros.zenoh_session import open_router
 
-        should_stop = _told_to_stop()
+        should_stop = told_to_stop()
         with closing(open_router(self.router)):
             print(f"router: listening at {self.router}", file=sys.stderr, flush=True)
             while not should_stop():
@@ -187,20 +232,24 @@ class Router:
 
 @dataclass(frozen=True)
 class All:
-    """The three nodes, each a process of its own, and a router if none answers."""
+    """The three nodes, each a process of its own, and with zenoh a router if none answers."""
 
     rope: OmitArgPrefixes[Rope]
     images: OmitArgPrefixes[Images]
-    joints: OmitArgPrefixes[Joints]
+    robot: OmitArgPrefixes[Robot]
+    commands: OmitArgPrefixes[Commands]
     reach: OmitArgPrefixes[Reach]
+    self_filter: bool = False
+    """Take the arm out of the images, by where its joints are."""
     simulate: bool = False
     """With the simulated camera and arm, and their settings in the place of a rope's."""
 
     def run(self) -> int:
-        import_extra("zenoh", "ros2")
+        way = self.reach.way()
+        if way == "zenoh":
+            import_extra("zenoh", "ros2")
         for module, extra in (("pinocchio", "arm"), *([("mujoco", "sim")] if self.simulate else [])):
             import_extra(module, extra)
-        from ropetrace.ros.zenoh_session import router_answers
 
         with tempfile.TemporaryDirectory(prefix="ropetrace-") as folder:
             rope = _flags(self.rope)
@@ -211,23 +260,28 @@ class All:
                 _write_settings(settings, cell_config())
                 rope = ["--config", str(settings)]
             else:
-                _check_camera_pose(self.rope.settings())
-            reach = _flags(self.reach)
+                _check_camera_pose(self.rope.settings(), "kinematic_system")
+            robot = _flags(self.robot)
+            filtered = [*robot, "--self-filter"] if self.self_filter else []
+            reach = _flags(dataclasses.replace(self.reach, ros=way))
             commands = {
-                "track_deformable": [*rope, *_flags(self.images), *reach],
+                "track_deformable": [*rope, *_flags(self.images), *filtered, *reach],
                 "trajectory_tracker": [*rope, *reach],
-                "kinematic_system": [*rope, *_flags(self.joints), *reach],
+                "kinematic_system": [*rope, *robot, *_flags(self.commands), *reach],
             }
             if self.simulate:
                 commands = {"sim": reach, **commands}
-            if not router_answers(self.reach.router):
-                commands = {"router": ["--router", self.reach.router], **commands}
-            return _supervise(commands, _told_to_stop())
+            if way == "zenoh":
+                from ropetrace.ros.zenoh_session import router_answers
+
+                if not router_answers(self.reach.router):
+                    commands = {"router": ["--router", self.reach.router], **commands}
+            return supervise(commands, told_to_stop())
 
 
 @dataclass(frozen=True)
 class Node:
-    """Live ROS 2 without a ROS installation: a node, or the whole graph.
+    """Live ROS, 2 or 1, with or without a ROS installation: a node, or the whole graph.
 
     ropetrace node all --simulate
     """
@@ -244,67 +298,19 @@ class Node:
     ]
 
     def run(self) -> int:
+        end_with_supervisor()
         return self.node.run()
 
 
 def _run(reach: Reach, name: str, make: Callable[[RosNode], Any]) -> int:
     """Make a node and let it run until Ctrl-C."""
-    should_stop = _told_to_stop()
+    should_stop = told_to_stop()
     with reach.node(name) as node:
         made = make(node)
         print(f"{name}: running", file=sys.stderr, flush=True)
         made.run(should_stop)
     print(f"{name}: ended", file=sys.stderr, flush=True)
     return 0
-
-
-def _told_to_stop() -> Callable[[], bool]:
-    """Whether an end was asked for, as by Ctrl-C: a loop ends where it chooses, not in the middle of a message."""
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: stop.set())
-    return stop.is_set
-
-
-def _supervise(commands: dict[str, list[str]], should_stop: Callable[[], bool]) -> int:
-    """Run the nodes until told to stop; one that ends is started again, unless what it was told is wrong.
-
-    Each is a process group of its own: Ctrl-C comes here alone, and to none that is still starting.
-    """
-    running: dict[str, subprocess.Popen[bytes]] = {}
-    due = dict.fromkeys(commands, 0.0)
-    try:
-        while not should_stop():
-            for name, flags in commands.items():
-                if name not in running and time.monotonic() >= due[name]:
-                    command = [sys.executable, "-m", "ropetrace", "node", name, *flags]
-                    running[name] = subprocess.Popen(command, process_group=0)
-            for name, process in list(running.items()):
-                code = process.poll()
-                if code is None or should_stop():
-                    continue
-                if code == BAD_INPUT:
-                    return BAD_INPUT
-                print(f"all: {name} ended with code {code}: it is started again", file=sys.stderr, flush=True)
-                del running[name]
-                due[name] = time.monotonic() + RESTART_AFTER
-            time.sleep(0.1)
-        return 0
-    finally:
-        _end(list(running.values()))
-
-
-def _end(processes: list[subprocess.Popen[bytes]]) -> None:
-    """Ask all to end, and wait; the first in the list last, since it may be the router."""
-    for process in reversed(processes):
-        process.terminate()
-    end = time.monotonic() + LONGEST_END
-    for process in processes:
-        try:
-            process.wait(max(end - time.monotonic(), 0.1))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
 
 
 def _flags(options: Any) -> list[str]:
@@ -319,18 +325,9 @@ def _flags(options: Any) -> list[str]:
     return flags
 
 
-def _domain_of_environment() -> int:
-    text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
-    if not text.isdecimal():
-        raise ConfigError(f"ROS_DOMAIN_ID = {text!r}: expected a number")
-    return int(text)
-
-
-def _check_camera_pose(config: RopeConfig) -> None:
+def _check_camera_pose(config: RopeConfig, who: str) -> None:
     if config.camera_pose is None:
-        raise ConfigError(
-            "kinematic_system needs camera_pose in the settings: the camera in the frame of the arm's base"
-        )
+        raise ConfigError(f"{who} needs camera_pose in the settings: the camera in the frame of the arm's base")
 
 
 def _write_settings(path: Path, config: RopeConfig) -> None:

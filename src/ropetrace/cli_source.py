@@ -77,7 +77,8 @@ class Source:
 
     recording: Annotated[Path, tyro.conf.Positional, arg(metavar="RECORDING")]
     """An RGB-D folder, a ROS 2 bag (.mcap, .db3, or their folder), a ROS 1 .bag, or point clouds (a folder of .npy,
-    .npz, .ply, .pcd, or one of them). Live: sim:SCENARIO, realsense: or realsense:SERIAL."""
+    .npz, .ply, .pcd, or one of them). Live: sim:SCENARIO, realsense:, realsense:SERIAL, ros2:,
+    ros2:tcp/HOST:PORT or ros1:."""
     part: OmitArgPrefixes[Part]
 
     def open(self) -> Recording:

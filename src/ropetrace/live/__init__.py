@@ -21,19 +21,38 @@ def scheme_of(address: str | Path) -> str | None:
     return match[1] if match and not Path(address).exists() else None
 
 
-def open_live(address: str | Path) -> LiveRecording:
-    """Open a camera by its address: ``sim:SCENARIO``, ``realsense:`` or ``realsense:SERIAL``.
+def open_live(
+    address: str | Path,
+    *,
+    depth_topic: str | None = None,
+    color_topic: str | None = None,
+    cloud_topic: str | None = None,
+) -> LiveRecording:
+    """Open a camera by its address.
+
+    Parameters
+    ----------
+    address : str
+        ``sim:SCENARIO``, ``realsense:``, ``realsense:SERIAL``, ``ros2:``, ``ros2:tcp/HOST:PORT`` or ``ros1:``.
+    depth_topic, color_topic, cloud_topic : str, optional
+        Of ROS; see `ropetrace.live.ros_camera.open_ros`.
 
     Raises
     ------
     RecordingError
-        If there is no such camera.
+        If there is no such camera, or it has no topics.
     ConfigError
-        If a scenario is unknown or wrong.
+        If a scenario is unknown or wrong; if a topic or an endpoint of ROS is impossible.
     MissingExtraError
         If the package that the camera needs is not installed.
     """
     scheme, _, name = str(address).partition(":")
+    if scheme in ("ros1", "ros2"):
+        from ropetrace.live.ros_camera import open_ros
+
+        return LiveRecording(str(address), open_ros(str(address), depth_topic, color_topic, cloud_topic))
+    if depth_topic is not None or color_topic is not None or cloud_topic is not None:
+        raise RecordingError(f"{address}: this live source has no topics: leave the topics out")
     if scheme == "sim":
         from ropetrace.errors import import_extra
 
@@ -46,6 +65,6 @@ def open_live(address: str | Path) -> LiveRecording:
 
         return LiveRecording(str(address), find_realsense(name))
     raise RecordingError(
-        f"{address}: there is no such file, and {scheme}: is no live source: give sim:SCENARIO, realsense: or "
-        "realsense:SERIAL"
+        f"{address}: there is no such file, and {scheme}: is no live source: give sim:SCENARIO, realsense:, "
+        "realsense:SERIAL, ros2:, ros2:tcp/HOST:PORT or ros1:"
     )

@@ -35,12 +35,12 @@ def open_recording(
     Parameters
     ----------
     path : path
-        A file or a folder; or ``sim:SCENARIO``, ``realsense:`` or ``realsense:SERIAL`` for a `LiveRecording`.
+        A file or a folder; or an address of `ropetrace.live.open_live`, such as ``ros2:``, for a `LiveRecording`.
     rate : float, optional
         Frames per second, for recordings that have no stamps of their own (and only for those).
     depth_topic, color_topic, cloud_topic : str, optional
-        Topics of a ROS recording that are used in place of those found by type and name. An empty
-        `color_topic` leaves colour out.
+        Topics of a ROS recording that are used in place of those found by type and name, or of a live ROS graph in
+        place of a RealSense's. An empty `color_topic` leaves colour out.
     max_pair_gap : float
         Colour farther than this from a depth image is not paired with it, seconds.
 
@@ -49,7 +49,7 @@ def open_recording(
     RecordingError
         If it cannot be read, or not as it was asked for; the message says what to do.
     ConfigError
-        If the scenario of a live simulation is unknown or wrong.
+        If the scenario of a live simulation is unknown or wrong; if a topic or an endpoint of ROS is impossible.
     MissingExtraError
         If the package that reads a .ply or .pcd cloud, or that a live camera needs, is not installed.
     """
@@ -58,9 +58,7 @@ def open_recording(
     if scheme_of(path) is not None:
         if rate is not None:
             raise RecordingError(f"{path}: a live source has stamps of its own: leave out --rate")
-        if depth_topic is not None or color_topic is not None or cloud_topic is not None:
-            raise RecordingError(f"{path}: a live source has no topics: leave the topics out")
-        return open_live(path)
+        return open_live(path, depth_topic=depth_topic, color_topic=color_topic, cloud_topic=cloud_topic)
     path = Path(path)
     if rate is not None and not (math.isfinite(rate) and 1e-3 <= rate <= 1e6):
         raise RecordingError(f"the rate {rate} is impossible: give frames per second, such as 30")

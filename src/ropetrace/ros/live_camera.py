@@ -18,10 +18,22 @@ MOST_APART_NS = 20_000_000
 """Between a depth image and its colour, nanoseconds."""
 
 LONGEST_WAIT_NS = 200_000_000
-"""A depth image whose colour has not come for this long is given up, nanoseconds."""
+"""A depth image whose colour or camera has not come for this long is given up, nanoseconds."""
+
+COLOR_PATIENCE_NS = 2_000_000_000
+"""Where images may lack their colour, they are taken without when none has come for this long after the first depth
+image, nanoseconds."""
 
 _KEPT = 4
-"""Images of each kind that wait for their partners."""
+"""Messages of each kind that wait to be looked at."""
+
+_WAITING = 32
+"""Images of each kind that wait for their partners at most."""
+
+
+def camera_info_beside(image: str) -> str:
+    """The topic of the camera of an image topic: ``/ns/camera_info`` beside ``/ns/image_raw``, as ROS has it."""
+    return f"{image.rpartition('/')[0]}/camera_info"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +50,7 @@ class CameraTopics:
     """sensor_msgs/Image, seen from the colour camera."""
     color: str = COLOR_TOPIC
     """sensor_msgs/Image; not read where the rope is not known by its colour."""
-    camera: str = "/camera/aligned_depth_to_color/camera_info"
+    camera: str = camera_info_beside(DEPTH_TOPIC)
     """sensor_msgs/CameraInfo of the depth images."""
     cloud: str | None = None
     """sensor_msgs/PointCloud2, in the place of the images."""
@@ -60,7 +72,7 @@ class Seen:
 
 
 class LiveCamera:
-    """Gives the newest frame there is; older ones are skipped.
+    """Gives the newest frame there is, and skips older ones; or one after another.
 
     Parameters
     ----------
@@ -69,7 +81,11 @@ class LiveCamera:
     topics : CameraTopics
         Which.
     wants_color : bool
-        Whether images need their colour.
+        Whether images have their colour.
+    may_lack_color : bool
+        Whether images go without their colour as long as none at all has come.
+    in_order : bool
+        Give every frame, as far as its messages came: for whoever takes them at once.
 
     Attributes
     ----------
@@ -77,9 +93,20 @@ class LiveCamera:
         Images that were passed over for newer ones, of those that were looked at.
     """
 
-    def __init__(self, node: RosNode, topics: CameraTopics, wants_color: bool) -> None:
+    def __init__(
+        self,
+        node: RosNode,
+        topics: CameraTopics,
+        wants_color: bool,
+        may_lack_color: bool = False,
+        in_order: bool = False,
+    ) -> None:
         self.skipped = 0
-        self._cloud = None if topics.cloud is None else node.subscription(topics.cloud, CLOUD)
+        self._in_order = in_order
+        self._may_lack_color = may_lack_color
+        self._first_depth_ns: int | None = None
+        self._cloud = None if topics.cloud is None else node.subscription(topics.cloud, CLOUD, _KEPT if in_order else 1)
+        self._clouds: deque[RawMessage] = deque()
         self._color: Subscription | None = None
         self._subscriptions = [self._cloud] if self._cloud is not None else []
         if self._cloud is None:
@@ -91,23 +118,28 @@ class LiveCamera:
                 self._subscriptions.append(self._color)
         self._intrinsics: Intrinsics | None = None
         self._camera_fault = f"no camera_info yet on {topics.camera}"
-        self._depths: deque[tuple[int, RawMessage]] = deque(maxlen=_KEPT)
-        self._colors: deque[tuple[int, RawMessage]] = deque(maxlen=_KEPT)
+        self._depths: deque[tuple[int, RawMessage]] = deque(maxlen=_WAITING)
+        self._colors: deque[tuple[int, RawMessage]] = deque(maxlen=_WAITING)
 
     @property
     def name(self) -> str:
         """The topic without which there is no frame."""
         return self._subscriptions[0].topic
 
+    @property
+    def waiting(self) -> int:
+        """Depth images that wait for their colour or their camera."""
+        return len(self._depths)
+
     def problem(self) -> str:
         """Which topics have the wrong type, in words; empty if none."""
         return "; ".join(filter(None, (subscription.problem() for subscription in self._subscriptions)))
 
-    def newest(self) -> Seen | None:
-        """The newest whole frame since the last call; a `BadFrame` where one cannot be used."""
+    def take(self) -> Seen | None:
+        """The newest whole frame since the last call, or the next one; a `BadFrame` where one cannot be used."""
         if self._cloud is not None:
-            message = self._cloud.newest()
-            return None if message is None else _cloud_frame(message)
+            self._clouds.extend(self._cloud.take())
+            return _cloud_frame(self._clouds.popleft()) if self._clouds else None
         self._learn_camera()
         for read, kept in ((self._depth, self._depths), (self._color, self._colors)):
             for message in [] if read is None else read.take():
@@ -115,13 +147,27 @@ class LiveCamera:
                     kept.append((ros_messages.stamp_and_frame(message)[0], message))
                 except FrameError as error:
                     return Seen(BadFrame(message.log_time_ns, str(error)), "")
+        if not self._depths:
+            return None
+        if self._first_depth_ns is None:
+            self._first_depth_ns = self._depths[0][1].log_time_ns
+        if self._intrinsics is None:
+            return self._given_up(self._camera_fault)
+        places = range(len(self._depths)) if self._in_order else range(len(self._depths) - 1, -1, -1)
         if self._color is None:
-            return self._leave(len(self._depths) - 1, None) if self._depths else None
-        for place in reversed(range(len(self._depths))):
+            return self._leave(places[0], None)
+        if self._may_lack_color and not self._colors:
+            patient = time.time_ns() - self._first_depth_ns < COLOR_PATIENCE_NS
+            return None if patient else self._leave(places[0], None)
+        self._may_lack_color = False
+        for place in places:
             color = self._color_of(self._depths[place][0])
             if color is not None and abs(color[0] - self._depths[place][0]) <= MOST_APART_NS:
                 return self._leave(place, color[1])
-        return self._given_up()
+        color = self._color_of(self._depths[0][0])
+        return self._given_up(
+            missing_color(None if color is None else abs(color[0] - self._depths[0][0]), MOST_APART_NS)
+        )
 
     def _learn_camera(self) -> None:
         message = self._camera.newest()
@@ -141,24 +187,25 @@ class LiveCamera:
         for _ in range(place):
             self._depths.popleft()
         stamp_ns, depth = self._depths.popleft()
+        while self._colors and self._colors[0][0] <= stamp_ns:
+            self._colors.popleft()
         frame_id = ros_messages.stamp_and_frame(depth)[1]
+        assert self._intrinsics is not None
         try:
-            if self._intrinsics is None:
-                raise FrameError(self._camera_fault)
             image, unit = ros_messages.depth_image(depth)
             pixels = None if color is None else ros_messages.color_image(color)
             return Seen(RgbdFrame(stamp_ns, image, unit, self._intrinsics, pixels), frame_id)
         except FrameError as error:
             return Seen(BadFrame(stamp_ns, f"{depth.topic}: {error}"), frame_id)
 
-    def _given_up(self) -> Seen | None:
-        """A depth image that has waited for its colour for too long."""
-        if not self._depths or time.time_ns() - self._depths[0][1].log_time_ns < LONGEST_WAIT_NS:
+    def _given_up(self, reason: str) -> Seen | None:
+        """The oldest depth image, if it has waited for its partners for too long."""
+        stamp_ns, depth = self._depths[0]
+        if len(self._depths) < _WAITING and time.time_ns() - depth.log_time_ns < LONGEST_WAIT_NS:
             return None
-        stamp_ns, depth = self._depths.popleft()
-        color = self._color_of(stamp_ns)
-        reason = missing_color(None if color is None else abs(color[0] - stamp_ns), MOST_APART_NS)
-        return Seen(BadFrame(stamp_ns, f"{depth.topic}: {reason}"), ros_messages.stamp_and_frame(depth)[1])
+        self._depths.popleft()
+        told = "; ".join(filter(None, (reason, self.problem())))
+        return Seen(BadFrame(stamp_ns, f"{depth.topic}: {told}"), ros_messages.stamp_and_frame(depth)[1])
 
 
 def _cloud_frame(message: RawMessage) -> Seen:

@@ -51,7 +51,6 @@ class CellSettings:
         If there is no such condition.
     """
 
-
     wind: float = 0.0
     """How often the wind turns in a second; 0 is no wind."""
     arm: str = "panda"
@@ -143,6 +142,11 @@ class SimulatedCell:
         while not should_stop():
             tick += 1
             now = self._now = tick / CONTROL_RATE
+            ahead = started + now - time.time()
+            if ahead < -MOST_BEHIND:
+                started -= ahead
+                self._reporter.tell(Status.DEGRADED, f"slower than real time: {-ahead:.1f} s were left out")
+            time.sleep(max(ahead, 0.0))
             self.moving.advance(now - self._arm_start, self._command())
             if camera.stamp(frame) <= self._warm_up + now:
                 self.simulated.robot = self.moving.capsules()
@@ -156,11 +160,6 @@ class SimulatedCell:
                 state = messages.joint_state(held, self._arm.joint_names, self.moving.position, self.moving.velocity)
                 self._joints.put(state)
             on_tick(now)
-            ahead = started + now - time.time()
-            if ahead < -MOST_BEHIND:
-                started -= ahead
-                self._reporter.tell(Status.DEGRADED, f"slower than real time: {-ahead:.1f} s were left out")
-            time.sleep(max(ahead, 0.0))
 
     def _command(self) -> FloatArray:
         message = self._commands.newest()

@@ -69,7 +69,7 @@ class TrackDeformable:
 
     def step(self) -> None:
         """Track the newest frame, if there is a new one."""
-        seen = self._camera.newest()
+        seen = self._camera.take()
         problem = self._camera.problem()
         if seen is not None:
             self._last = time.monotonic()

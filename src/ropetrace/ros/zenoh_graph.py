@@ -6,7 +6,6 @@ numbers it. Who publishes or reads declares a token under ``@ros2_lv``; ``ros2 t
 
 from __future__ import annotations
 
-import hashlib
 import re
 import struct
 import threading
@@ -22,6 +21,9 @@ from ropetrace.ros.zenoh_session import Connection, open_session
 ADMIN_SPACE = "@ros2_lv"
 NO_HASH = "TypeHashNotSupported"
 """What Humble has in the place of a type's hash."""
+
+_LISTING_SECONDS = 0.5
+"""How long `ZenohNode.topics` waits for answers."""
 
 
 def dds_type(name: str) -> str:
@@ -90,13 +92,24 @@ def attachment(sequence: int, source_ns: int, gid: bytes) -> bytes:
     return struct.pack("<qqB16s", sequence, source_ns, 16, gid)
 
 
+def publisher_id(token: str) -> bytes:
+    """The GID of a publisher, 16 bytes: XXH3-128 of its token, the lower half first, as rmw_zenoh has it.
+
+    Raises
+    ------
+    MissingExtraError
+        If xxhash is not installed.
+    """
+    return import_extra("xxhash", "ros2").xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
+
+
 class ZenohPublisher:
     """A `graph.Publisher`; made by `ZenohNode.publisher`."""
 
     def __init__(self, publisher: Any, name: str, type_name: str) -> None:
         self._publisher = publisher
         self._type = type_name
-        self._gid = hashlib.blake2b(name.encode(), digest_size=16).digest()
+        self._gid = publisher_id(name)
         self._sequence = 0
 
     def put(self, message: Any) -> None:
@@ -194,6 +207,20 @@ class ZenohNode:
             liveliness.declare_subscriber(publishers, lambda sample: _meet(read, sample, humble), history=True),
         ]
         return read
+
+    def topics(self) -> dict[str, str]:
+        """What is published, and its type, as far as it is known half a second after the question."""
+        found: dict[str, str] = {}
+
+        def meet(sample: Any) -> None:
+            parts = str(sample.key_expr).split("/")
+            found[parts[9].replace("%", "/")] = ros_type(parts[10])
+
+        # A one-shot query of a peer now and then ends before anybody has answered; a subscriber does not.
+        publishers = f"{ADMIN_SPACE}/{self.connection.domain}/*/*/*/MP/*/*/*/*/*/*/*"
+        with self._session.liveliness().declare_subscriber(publishers, meet, history=True):
+            time.sleep(_LISTING_SECONDS)
+        return found
 
     def wait(self, seconds: float) -> None:
         """Wait until a message of any subscription has come since the last call, or for this long."""

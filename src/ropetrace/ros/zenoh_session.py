@@ -12,6 +12,9 @@ from ropetrace.errors import ConfigError, RosError, import_extra
 ROUTER = "tcp/127.0.0.1:7447"
 """Where the router of rmw_zenoh listens."""
 
+START_ROUTER = "start one with `ropetrace node router`, or `ros2 run rmw_zenoh_cpp rmw_zenohd`"
+"""What to do where no router answers."""
+
 MOST_DOMAINS = 232
 """The greatest ROS_DOMAIN_ID."""
 

@@ -1,0 +1,327 @@
+"""The camera of a running ROS graph as a live source."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("zenoh")
+pytest.importorskip("xxhash")
+
+from ropetrace.errors import ConfigError, MissingExtraError, RecordingError, RopetraceError
+from ropetrace.live import LiveRecording, ros_camera
+from ropetrace.recordings import open_recording
+from ropetrace.recordings.ros_frames import CLOUD_TOPIC, COLOR_TOPIC, DEPTH_TOPIC, frame_messages
+from ropetrace.recordings.ros_messages import CAMERA, IMAGE
+from ropetrace.ros import live_camera
+from ropetrace.ros.graph import Subscription
+from ropetrace.ros.live_camera import CameraTopics, LiveCamera, camera_info_beside
+from ropetrace.ros.zenoh_graph import ZenohNode
+from ropetrace.ros.zenoh_session import Connection
+from ropetrace.types import BadFrame, CloudFrame, Event, Frame, Intrinsics, RgbdFrame
+from ros_rig import free_endpoint, routed, until
+
+LENS = Intrinsics(4, 3, 5.0, 6.0, 1.5, 1.0)
+DEPTH = np.arange(12, dtype=np.uint16).reshape(3, 4) + 1000
+COLOR = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
+POINTS = np.arange(6, dtype=np.float32).reshape(2, 3) + 1
+
+
+def rgbd() -> RgbdFrame:
+    return RgbdFrame(time.time_ns(), DEPTH, 0.001, LENS, COLOR)
+
+
+def gray() -> RgbdFrame:
+    return RgbdFrame(time.time_ns(), DEPTH, 0.001, LENS, None)
+
+
+def cloud() -> CloudFrame:
+    return CloudFrame(time.time_ns(), POINTS)
+
+
+@contextmanager
+def publishing(connection: Connection, frame: Any, under: str = "") -> Iterator[None]:
+    """A camera of its own node that publishes frames, 50 a second, under a prefix of the usual topics."""
+    stop = threading.Event()
+
+    def run() -> None:
+        with ZenohNode("camera", connection) as node:
+            made: dict[str, Any] = {}
+            while not stop.wait(0.02):
+                for message in frame_messages(frame()):
+                    if message.topic not in made:
+                        made[message.topic] = node.publisher(under + message.topic, message.type)
+                    made[message.topic].put_packed(bytes(message.data))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def opened(connection: Connection, **topics: str) -> LiveRecording:
+    recording = open_recording(f"ros2:{connection.router}", **topics)  # type: ignore[arg-type]
+    assert isinstance(recording, LiveRecording)
+    return recording
+
+
+def first(recording: LiveRecording, count: int = 3) -> list[Event]:
+    return list(recording.frames(limit=count))
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    monkeypatch.setattr(live_camera, "COLOR_PATIENCE_NS", 300_000_000)
+
+
+def test_images_with_their_colour_and_their_true_age(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_camera, "COLOR_PATIENCE_NS", 10_000_000_000)
+    with routed() as connection, publishing(connection, rgbd):
+        recording = opened(connection)
+        # A busy machine may lose one.
+        frames = (event for event in recording.frames() if isinstance(event, RgbdFrame))
+        stamps = []
+        for _ in range(5):
+            frame = next(frames)
+            assert frame.color is not None
+            stamps.append(frame.stamp_ns)
+        age = recording.age()
+        recording.close()
+    np.testing.assert_array_equal(frame.depth, DEPTH)
+    np.testing.assert_array_equal(frame.color, COLOR)
+    assert frame.depth_unit_m == 0.001
+    assert frame.intrinsics == recording.intrinsics == LENS
+    assert stamps == sorted(set(stamps))
+    # The stamps are this machine's time, so the age counts from them.
+    assert not any("counts from the frames' arrival" in line for line in recording.clock_lines())
+    assert 0 < age < 5
+    assert recording.kind == "live ROS 2 camera"
+
+
+def test_images_whose_colour_nobody_publishes_come_without() -> None:
+    with routed() as connection, publishing(connection, gray):
+        event = first(opened(connection))[-1]
+    assert isinstance(event, RgbdFrame)
+    assert event.color is None
+
+
+def test_colour_that_is_left_out_and_colour_that_was_asked_for() -> None:
+    with routed() as connection:
+        with publishing(connection, rgbd):
+            event = first(opened(connection, color_topic=""))[-1]
+            assert isinstance(event, RgbdFrame)
+            assert event.color is None
+        with publishing(connection, gray):
+            event = first(opened(connection, color_topic=COLOR_TOPIC))[-1]
+            assert isinstance(event, BadFrame)
+            assert "no colour image within 20 ms" in event.reason
+
+
+def test_other_topics_have_the_camera_info_beside_them() -> None:
+    with routed() as connection, publishing(connection, gray, under="/left"):
+        event = first(opened(connection, depth_topic=f"/left{DEPTH_TOPIC}"))[-1]
+    assert isinstance(event, RgbdFrame)
+    assert camera_info_beside("/left/depth/image_raw") == "/left/depth/camera_info"
+
+
+def test_clouds() -> None:
+    with routed() as connection, publishing(connection, cloud):
+        event = first(opened(connection, cloud_topic=CLOUD_TOPIC))[-1]
+    assert isinstance(event, CloudFrame)
+    np.testing.assert_array_equal(event.points, POINTS)
+
+
+def test_no_router() -> None:
+    endpoint = free_endpoint()
+    with pytest.raises(RecordingError, match=f"no router at {endpoint}: start one with `ropetrace node router`"):
+        first(opened(Connection(router=endpoint)))
+
+
+def test_a_graph_without_this_camera_names_those_that_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros_camera, "PRESENT_SECONDS", 1.0)
+    with routed() as connection:
+        with pytest.raises(RecordingError, match=f"nothing came on {DEPTH_TOPIC} .* there are no images and no clouds"):
+            first(opened(connection))
+        with publishing(connection, gray, under="/left"), publishing(connection, cloud):
+            with pytest.raises(RecordingError, match="choose with --depth-topic or --cloud-topic") as caught:
+                first(opened(connection))
+            assert f"{CLOUD_TOPIC} (PointCloud2), /left{DEPTH_TOPIC} (Image)" in str(caught.value)
+        with ZenohNode("camera", connection) as silent:
+            silent.publisher(DEPTH_TOPIC, IMAGE)
+            with pytest.raises(RecordingError, match="it is published, but silent"):
+                first(opened(connection))
+        with ZenohNode("camera", connection) as wrong:
+            wrong.publisher(DEPTH_TOPIC, CAMERA)
+            with pytest.raises(RecordingError, match="CameraInfo, expected sensor_msgs/msg/Image: not read"):
+                first(opened(connection))
+
+
+def test_a_camera_of_another_domain_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros_camera, "PRESENT_SECONDS", 1.0)
+    with routed() as connection, publishing(connection, gray):
+        monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+        with pytest.raises(RecordingError, match=r"no clouds at .* with ROS_DOMAIN_ID=7"):
+            first(opened(connection))
+
+
+def test_a_camera_that_goes_and_returns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros_camera, "PRESENT_SECONDS", 1.0)
+    monkeypatch.setattr("ropetrace.live.stream.RESTART_SECONDS", 1.0)
+    monkeypatch.setattr("ropetrace.live.stream.RETRY_SECONDS", 0.1)
+    with routed() as connection:
+        recording = opened(connection)
+        recording._silence = 0.2
+        frames = recording.frames()
+        with publishing(connection, rgbd):
+            assert isinstance(next(frames), RgbdFrame)
+        # Away for so long that it is looked for anew.
+        until(lambda: "nothing came on" in getattr(next(frames), "reason", ""))
+        with publishing(connection, rgbd):
+            until(lambda: isinstance(next(frames), RgbdFrame))
+        frames.close()  # type: ignore[attr-defined]
+    assert any("gave no frame for" in problem for problem in recording.problems)
+
+
+@pytest.mark.parametrize(
+    ("address", "options", "error", "words"),
+    [
+        ("ros2:", {"cloud_topic": "/c", "depth_topic": "/d"}, RecordingError, "but not both"),
+        ("ros2:", {"depth_topic": "d"}, ConfigError, "no full name of a topic"),
+        ("ros2:", {"rate": 30.0}, RecordingError, "leave out --rate"),
+        ("ros2:127.0.0.1:7447", {}, ConfigError, "expected an endpoint such as tcp/"),
+        ("ros1:somewhere", {}, RecordingError, "the master in ROS_MASTER_URI"),
+    ],
+)
+def test_the_door_refuses(address: str, options: dict[str, Any], error: type[RopetraceError], words: str) -> None:
+    with pytest.raises(error, match=words):
+        open_recording(address, **options)
+
+
+def test_a_domain_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "home")
+    with pytest.raises(ConfigError, match="ROS_DOMAIN_ID = 'home'"):
+        open_recording("ros2:tcp/127.0.0.1:7447")
+
+
+def test_ros1_without_rospy_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rospy", None)
+    with pytest.raises(MissingExtraError, match="rospy"):
+        open_recording("ros1:")
+
+
+class Topics:
+    """A node whose messages a test writes."""
+
+    name = "topics"
+
+    def __init__(self) -> None:
+        self.read: dict[str, Subscription] = {}
+
+    def subscription(self, topic: str, type_name: str, depth: int = 1) -> Subscription:
+        return self.read.setdefault(topic, Subscription(topic, type_name, depth, threading.Event()))
+
+    def send(self, frame: Frame, *left_out: str) -> None:
+        for message in frame_messages(frame):
+            if message.topic in self.read and message.topic not in left_out:
+                self.read[message.topic].receive(bytes(message.data), "cdr")
+
+
+def seen_for(camera: LiveCamera, topics: Topics, *left_out: str, seconds: float = 0.5) -> list[Event]:
+    """What a camera of 100 frames a second gives: three frames at least."""
+    found: list[Event] = []
+    end = time.monotonic() + seconds
+    while time.monotonic() < end or len(found) < 3:
+        topics.send(rgbd(), *left_out)
+        seen = camera.take()
+        if seen is not None:
+            found.append(seen.event)
+        time.sleep(0.01)
+    return found
+
+
+def test_a_fast_camera_without_its_partners_is_told_and_not_silent() -> None:
+    topics = Topics()
+    camera = LiveCamera(topics, CameraTopics(), wants_color=True)  # type: ignore[arg-type]
+    info = camera_info_beside(DEPTH_TOPIC)
+    reasons = {getattr(event, "reason", "") for event in seen_for(camera, topics, info)}
+    assert reasons == {f"{DEPTH_TOPIC}: no camera_info yet on {info}"}
+    reasons = {getattr(event, "reason", "") for event in seen_for(camera, topics, COLOR_TOPIC)}
+    assert any("no colour image within 20 ms" in reason for reason in reasons)
+    assert isinstance(seen_for(camera, topics)[-1], RgbdFrame)
+
+
+def test_colour_that_came_once_is_waited_for() -> None:
+    topics = Topics()
+    camera = LiveCamera(topics, CameraTopics(), wants_color=True, may_lack_color=True)  # type: ignore[arg-type]
+    without = seen_for(camera, topics, COLOR_TOPIC)
+    assert {type(event) for event in without} == {RgbdFrame}
+    assert all(event.color is None for event in without if isinstance(event, RgbdFrame))
+    complete = seen_for(camera, topics, seconds=0.2)
+    assert isinstance(complete[-1], RgbdFrame)
+    assert complete[-1].color is not None
+    assert isinstance(seen_for(camera, topics, COLOR_TOPIC)[-1], BadFrame)
+
+
+ROS1_CAMERA = """
+import rospy, time
+from sensor_msgs.msg import CameraInfo, Image
+rospy.init_node("camera", disable_signals=True)
+put = {name: rospy.Publisher("/camera/aligned_depth_to_color/" + name, kind, queue_size=2)
+       for name, kind in (("image_raw", Image), ("camera_info", CameraInfo))}
+while True:
+    info = CameraInfo(width=4, height=3, K=[5, 0, 1.5, 0, 6, 1, 0, 0, 1])
+    image = Image(width=4, height=3, encoding="16UC1", step=8, data=b"\\x01\\x04" * 12)
+    info.header.stamp = image.header.stamp = rospy.Time.from_sec(time.time())
+    put["camera_info"].publish(info)
+    put["image_raw"].publish(image)
+    time.sleep(0.03)
+"""
+
+ROS1_READER = """
+import json
+from ropetrace.recordings import open_recording
+from ropetrace.errors import RecordingError
+try:
+    next(open_recording("ros1:", depth_topic="/nope/image_raw").frames())
+except RecordingError as error:
+    print(json.dumps(str(error)), flush=True)
+for _ in range(2):
+    recording = open_recording("ros1:")
+    for frame in recording.frames(limit=3):
+        last = frame
+    print(json.dumps([type(last).__name__, int(last.depth[0, 0]), last.intrinsics.fx, last.color is None,
+                      recording.clock_lines()]), flush=True)
+"""
+
+
+def test_ros1(tmp_path: Path) -> None:
+    ros1 = pytest.importorskip("test_ros1")
+    if ros1.missing():
+        pytest.skip(f"ROS 1: {ros1.missing()}")
+    core = ros1.Core(tmp_path)
+    command = [sys.executable, "-c", ROS1_READER]
+    try:
+        core.start()
+        with core.debian(ROS1_CAMERA):
+            core.came("/camera/aligned_depth_to_color/camera_info")
+            done = subprocess.run(command, env=core.our_env, capture_output=True, text=True, timeout=90, check=True)
+    finally:
+        core.stop()
+    missing, *frames = map(json.loads, done.stdout.splitlines())
+    assert "nothing came on /nope/image_raw" in missing
+    assert f"there are {DEPTH_TOPIC} (Image)" in missing
+    assert frames == [["RgbdFrame", 0x0401, 5.0, True, []]] * 2
