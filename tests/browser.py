@@ -15,7 +15,7 @@ from urllib.request import ProxyHandler, build_opener
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
-_PATIENCE = 30.0
+_PATIENCE = 120.0
 """Seconds that a test waits for the browser."""
 
 
@@ -72,12 +72,13 @@ class Tab:
 
 
 @contextmanager
-def chromium(folder: Path, width: int = 1300, height: int = 860) -> Iterator[Tab]:
+def chromium(folder: Path, width: int = 1400, height: int = 900) -> Iterator[Tab]:
     """A browser with one empty page, and nothing of anybody's profile."""
     from websockets.sync.client import connect
 
     assert CHROMIUM is not None
     command = [CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", "--no-proxy-server"]
+    command += ["--disable-quic", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
     command += [f"--window-size={width},{height}", "--remote-debugging-port=0", f"--user-data-dir={folder}"]
     process = subprocess.Popen([*command, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:

@@ -6,19 +6,23 @@ import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
 
 from ropetrace.cli_source import Source, TrackedRope
 from ropetrace.errors import ConfigError, OutputError
+from ropetrace.live import scheme_of
+
+if TYPE_CHECKING:
+    from ropetrace.tuning import Tuning
 
 LOOPBACK = "127.0.0.1"
 
 
 @dataclass(frozen=True)
 class Tune:
-    """Find the settings by eye, in a page in the browser, and save them as a TOML file."""
+    """Find the settings by eye, in a page in the browser, and save them as a TOML file: for a recording, or live."""
 
     source: OmitArgPrefixes[Source]
     rope: OmitArgPrefixes[TrackedRope]
@@ -29,26 +33,30 @@ class Tune:
     It is not encrypted."""
     port: Annotated[int, arg(metavar="N")] = 0
     """Listen on this port; 0: any that is free."""
-    overwrite: bool = False
-    """Replace a file of settings that exists."""
 
     def run(self) -> int:
         from ropetrace.tune_page import TunePage
-        from ropetrace.tuning import Tuning
 
         if not 0 <= self.port <= 65535:
             raise ConfigError(f"--port {self.port}: expected 0 to 65535")
-        if self.out.exists() and not self.overwrite:
-            raise OutputError(f"{self.out} exists already: choose another name or give --overwrite")
-        part = self.source.part
-        recording = part.open(self.source.recording)
-        config = None if self.rope == TrackedRope() else self.rope.settings(self.source.first_frames)
-        tuning = Tuning(recording, config, part.start, part.limit)
+        if self.out.is_dir() or not self.out.absolute().parent.is_dir():
+            raise OutputError(f"--out {self.out}: give a file in a folder that exists")
         if self.bind != LOOPBACK:
             print(f"warning   {self.bind} may be reached by other machines, and is not encrypted", file=sys.stderr)
-        # An interrupt is the ordinary end.
-        with suppress(KeyboardInterrupt), TunePage(tuning, self.out, self.bind, self.port) as page:
+        opened = None if scheme_of(self.source.recording) else self._open()
+        # An interrupt is the ordinary end, also before the page runs.
+        with (
+            suppress(KeyboardInterrupt),
+            TunePage(lambda: opened or self._open(), self.out, self.bind, self.port) as page,
+        ):
             print(f"page      {page.url}\nopen it in a browser; Ctrl-C ends it", flush=True)
-            page.wait()
-        print(f"settings  {self.out}" if self.out.exists() else "nothing was saved")
+            page.run_until_interrupted()
+        print(f"settings  {self.out}" if page.file.was_saved else "nothing was saved")
         return 0
+
+    def _open(self) -> Tuning:
+        from ropetrace.tuning import Tuning
+
+        recording = self.source.open()
+        config = None if self.rope == TrackedRope() else self.rope.settings(self.source.first_frames)
+        return Tuning(recording, config, self.source.part.start, self.source.part.limit)

@@ -1,10 +1,8 @@
-"""The page of `ropetrace tune`: what is sent to the browser, and the server that sends it to nobody else."""
+"""The server of `ropetrace tune`: sends its page, and what it shows, to the browsers that may have it."""
 
 from __future__ import annotations
 
-import base64
 import hmac
-import io
 import ipaddress
 import json
 import os
@@ -12,8 +10,11 @@ import secrets
 import socket
 import sys
 import threading
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from http import HTTPStatus
 from importlib.metadata import version
 from importlib.resources import files
@@ -21,19 +22,10 @@ from pathlib import Path
 from typing import Any, Self
 from urllib.parse import parse_qs, urlsplit
 
-import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
-
-from ropetrace.config import default_variance_threshold
 from ropetrace.errors import ConfigError, OutputError, RopetraceError, import_extra
-from ropetrace.picture import backdrop, pixels_of
 from ropetrace.recordings.base import printable
-from ropetrace.tuning import TUNED, Look, Tuning
-from ropetrace.types import BadFrame, Cloud, Estimate, Event, FloatArray, Intrinsics, RgbdFrame
-
-_MOST_POINTS = 4000
-"""Points that are shown in space."""
+from ropetrace.tune_message import message_of
+from ropetrace.tuning import Look, Tuning
 
 _MOST_BYTES = 65_536
 """The longest message that is taken from a browser."""
@@ -44,8 +36,23 @@ _ANY = ("", "0.0.0.0", "::")
 _HANDSHAKE = 2.0
 """Browsers open connections in advance; one that asks for nothing is closed after this, seconds."""
 
-_NO_IMAGE = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
-"""What a bad frame is shown as: nothing."""
+_FAREWELL = 2.0
+"""How long a browser may take to close its connection, seconds."""
+
+_SHORTEST_STEP = 1 / 15
+"""Between two frames that are sent to one browser, seconds."""
+
+_RETRY_SECONDS = 1.0
+"""How often a source that failed is begun anew."""
+
+_PACE_SECONDS = 2.0
+"""The frames of this long make the rate that is shown."""
+
+_GLANCE_SECONDS = 0.25
+"""How often it is asked whether there is something to do."""
+
+_LONGEST_END = 5.0
+"""How long the frame that is looked at may take to the end, seconds; the compiler is not waited for."""
 
 _HEADERS = {
     "Content-Type": "text/html; charset=utf-8",
@@ -58,79 +65,6 @@ _HEADERS = {
     "Cache-Control": "no-store",
     "Connection": "close",
 }
-
-
-def message_of(tuning: Tuning, look: Look) -> dict[str, Any]:
-    """All that the page shows, ready for JSON; lengths in metres, places in the image in pixels."""
-    picture, camera = _picture(look.event, look.cloud)
-    corners = tuning.box_corners()
-    return {
-        "index": look.index,
-        "first": tuning.first,
-        "end": tuning.end,
-        "width": camera.width,
-        "height": camera.height,
-        "camera": [camera.fx, camera.fy, camera.cx, camera.cy],
-        "image": _data_url(picture, "JPEG"),
-        "passing": _data_url(_passing(look.cloud, camera), "PNG"),
-        "passed": look.estimates[0].point_count,
-        "gated": tuning.config.asks_for_color or corners is not None or not _has_color(look.event),
-        "points": _rounded(look.cloud.points[:: len(look.cloud.points) // _MOST_POINTS + 1]),
-        "slices": _rounded(look.slices),
-        "box": None if corners is None else _rounded(corners),
-        "ropes": [_rope(estimate) for estimate in look.estimates],
-        "settings": {name: _setting(tuning, name) for name in TUNED},
-        "variance_threshold": default_variance_threshold(tuning.config.diameter),
-    }
-
-
-def _has_color(event: Event) -> bool:
-    return isinstance(event, RgbdFrame) and event.color is not None
-
-
-def _picture(event: Event, cloud: Cloud) -> tuple[Image.Image, Intrinsics]:
-    if isinstance(event, BadFrame):
-        return Image.new("RGB", (_NO_IMAGE.width, _NO_IMAGE.height)), _NO_IMAGE
-    if isinstance(event, RgbdFrame) and event.color is not None:
-        return Image.fromarray(event.color), event.intrinsics
-    return backdrop(event, cloud)
-
-
-def _passing(cloud: Cloud, camera: Intrinsics) -> Image.Image:
-    """The pixels that pass, on nothing."""
-    columns, rows = np.round(pixels_of(cloud.points, camera)).astype(int).T
-    inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
-    passing: NDArray[np.uint8] = np.zeros((camera.height, camera.width, 4), np.uint8)
-    passing[rows[inside], columns[inside]] = (0, 255, 210, 150)
-    return Image.fromarray(passing)
-
-
-def _data_url(picture: Image.Image, kind: str) -> str:
-    stream = io.BytesIO()
-    picture.save(stream, kind)
-    return f"data:image/{kind.lower()};base64,{base64.b64encode(stream.getvalue()).decode()}"
-
-
-def _rope(estimate: Estimate) -> dict[str, Any]:
-    count = len(estimate.waypoints)
-    return {
-        "status": str(estimate.status),
-        "reasons": list(estimate.reasons),
-        "length": float(estimate.waypoints.length) if count else 0.0,
-        "nodes": _rounded(estimate.nodes),
-        "line": _rounded(estimate.waypoints.positions),
-        "seen": [True] * count if estimate.seen is None else estimate.seen.tolist(),
-    }
-
-
-def _rounded(points: FloatArray) -> list[list[float]]:
-    """To a hundredth of a millimetre, which is less to send."""
-    return np.round(points, 5).tolist()
-
-
-def _setting(tuning: Tuning, name: str) -> Any:
-    section, _, key = name.rpartition(".")
-    return getattr(getattr(tuning.config, section) if section else tuning.config, key)
 
 
 def refusal(host: str, origin: str | None, token: str, given: str) -> str | None:
@@ -160,30 +94,89 @@ def _is_address(name: str) -> bool:
     return True
 
 
-def save_settings(text: str, path: Path) -> None:
-    """Write settings, whole or not at all.
+@dataclass(eq=False)
+class SettingsFile:
+    """Where settings are saved.
 
-    Raises
-    ------
-    OutputError
-        If they cannot be written.
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Attributes
+    ----------
+    was_saved : bool
+        Whether `save` has written it.
     """
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(f"# ropetrace {version('ropetrace')}, tuned by eye\n{text}", encoding="utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
+
+    path: Path
+    _written: bytes | None = None
+
+    @property
+    def was_saved(self) -> bool:
+        return self._written is not None
+
+    def is_of_others(self) -> bool:
+        """Whether there is a file that is not what was saved last."""
+        try:
+            return self.path.read_bytes() != self._written
+        except FileNotFoundError:
+            return False
+        except OSError:
+            return self.path.exists()
+
+    def save(self, text: str) -> None:
+        """Write settings, whole or not at all.
+
+        Raises
+        ------
+        OutputError
+            If they cannot be written.
+        """
+        content = f"# ropetrace {version('ropetrace')}, tuned by eye\n{text}".encode()
+        part = self.path.with_name(self.path.name + ".part")
+        try:
+            part.write_bytes(content)
+            os.replace(part, self.path)
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from None
+        self._written = content
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shown:
+    """What all browsers are shown; `change` is the last request that counts in it."""
+
+    change: int
+    look: Look | None = None
+    busy: str = ""
+    rate: float = 0.0
+
+
+@dataclass(slots=True, eq=False)
+class _Seat:
+    """One browser: whether it is there, and has shown what it was sent last; and what it asked for last.
+
+    `change` is the place of its last request among all, `serial` its own number of it, `version` that of the state that
+    was sent last, and `sent` are the looks of which it shows one.
+    """
+
+    is_open: bool = True
+    is_ready: bool = True
+    change: int = 0
+    serial: int = 0
+    version: int = 0
+    sent: deque[Look] = field(default_factory=lambda: deque(maxlen=2))
 
 
 @dataclass(eq=False)
 class TunePage:
-    """Serves the page as long as it is entered, to one browser at a time that has the token in its address.
+    """Serves the page as long as it is entered, to browsers that have the token in its address.
 
     Parameters
     ----------
-    tuning : Tuning
-        What the page shows and changes.
+    open_tuning : callable
+        Makes what the page shows and changes; called by `run`, so that the page can say what it waits for.
     out : Path
         Where its button saves the settings; no request can name another.
     bind : str
@@ -191,23 +184,47 @@ class TunePage:
     port : int
         0 for any that is free.
 
+    Attributes
+    ----------
+    tuning : Tuning, optional
+        None as long as the source is not open.
+
     Raises
     ------
     MissingExtraError
         If websockets is not installed.
     OutputError
         If the address cannot be listened on.
+
+    Notes
+    -----
+    `run` reads frames and looks at them, in the thread that calls it. A thread for each browser does what it asks for;
+    another sends it the newest that there is, one frame at a time: the next one goes out when the browser has shown
+    the last.
     """
 
-    tuning: Tuning
+    open_tuning: Callable[[], Tuning]
     out: Path
     bind: str = "127.0.0.1"
     port: int = 0
     token: str = field(default_factory=lambda: secrets.token_urlsafe(16))
-    _seat: threading.Lock = field(default_factory=threading.Lock)
+    tuning: Tuning | None = None
 
     def __post_init__(self) -> None:
         serve = import_extra("websockets.sync.server", "tune").serve
+        self._closed = import_extra("websockets.exceptions", "tune").ConnectionClosed
+        self.file = SettingsFile(self.out)
+        self._news = threading.Condition()
+        self._acting = threading.Lock()
+        self._shown = _Shown(0, busy="One moment")
+        self._version = 1
+        self._change = 0
+        self._said: list[str] = []
+        self._trouble = ""
+        self._asks_to_replace = False
+        self._stopping = False
+        self._encoding = threading.Lock()
+        self._encoded = (0, "")
         try:
             self._server = serve(
                 self._talk,
@@ -215,13 +232,14 @@ class TunePage:
                 self.port,
                 process_request=self._answer,
                 open_timeout=_HANDSHAKE,
+                close_timeout=_FAREWELL,
                 max_size=_MOST_BYTES,
+                compression=None,
                 server_header=None,
             )
         except (OSError, OverflowError) as error:
             raise OutputError(f"{self.bind}:{self.port}: cannot be listened on: {error}") from None
         self.port = self._server.socket.getsockname()[1]
-        # An interrupt reaches the main thread only, and so never the middle of what the server does.
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
 
     @property
@@ -236,12 +254,223 @@ class TunePage:
         return self
 
     def __exit__(self, *error: object) -> None:
+        self.stop()
         self._server.shutdown()
         self._thread.join()
 
-    def wait(self) -> None:
-        """Return when the server has ended, which is for an interrupt to bring about."""
-        self._thread.join()
+    def stop(self) -> None:
+        """End `run`."""
+        with self._news:
+            self._stopping = True
+            self._news.notify_all()
+
+    # --- what is shown ---
+
+    def run_until_interrupted(self) -> None:
+        """`run` in a thread of its own, until Ctrl-C, which is the ordinary end.
+
+        An interrupt reaches the main thread alone: while that only sleeps, no lock stays taken, and the compiler, whose
+        callbacks swallow it, is not in its way.
+
+        Raises
+        ------
+        RopetraceError
+            If the source cannot be opened.
+        """
+        errors: list[Exception] = []
+
+        def look() -> None:
+            try:
+                self.run()
+            except Exception as error:
+                errors.append(error)
+
+        looking = threading.Thread(target=look, name="looking", daemon=True)
+        looking.start()
+        with suppress(KeyboardInterrupt):
+            while looking.is_alive():
+                time.sleep(_GLANCE_SECONDS)
+        self.stop()
+        looking.join(_LONGEST_END)
+        if looking.is_alive() and self.tuning is not None:
+            self.tuning.close()
+        if errors:
+            raise errors[0]
+
+    def run(self) -> None:
+        """Look at frames until `stop`.
+
+        Raises
+        ------
+        RopetraceError
+            If the source cannot be opened.
+        """
+        self._show(_Shown(0, busy="Opening the source"))
+        tuning = self.tuning = self.open_tuning()
+        try:
+            self._show(
+                _Shown(
+                    0,
+                    tuning.glance(),
+                    "Click on the rope. What passes is shown when the compiler is done: half a minute, the first time",
+                )
+            )
+            self._look_on(tuning)
+        finally:
+            tuning.close()
+
+    def _look_on(self, tuning: Tuning) -> None:
+        times: deque[float] = deque()
+        looked = -1
+        while not self._stopping:
+            with self._news:
+                if not tuning.wants_frame and looked == self._change:
+                    self._news.wait(_GLANCE_SECONDS)
+                    continue
+                change = self._change
+            # The first look is at the frame that the glance was at.
+            works = tuning.take() if looked >= 0 and tuning.wants_frame else True
+            look, trouble = _looked(tuning)
+            now = time.monotonic()
+            times.append(now)
+            while now - times[0] > _PACE_SECONDS:
+                times.popleft()
+            rate = (len(times) - 1) / (now - times[0]) if now - times[0] > _PACE_SECONDS / 2 else 0.0
+            self._show(_Shown(change, look, rate=rate), trouble)
+            looked = change
+            if not works:
+                with self._news:
+                    self._news.wait(_RETRY_SECONDS)
+
+    def _show(self, shown: _Shown, trouble: str = "") -> None:
+        with self._news:
+            if shown.change < self._shown.change:
+                return
+            self._shown = shown
+            self._trouble = trouble or self._trouble
+            self._version += 1
+            self._news.notify_all()
+
+    def _text_of_newest(self) -> tuple[int, _Shown, str]:
+        """The newest that there is to show: its version, and its JSON, which is made once for all browsers."""
+        with self._encoding:
+            with self._news:
+                number, shown, tuning = self._version, self._shown, self.tuning
+                state: dict[str, Any] = {
+                    "busy": shown.busy,
+                    "said": self._said,
+                    "trouble": self._trouble,
+                    "out": str(self.out),
+                    "asks_to_replace": self._asks_to_replace,
+                    "rate": shown.rate,
+                }
+            if self._encoded[0] != number:
+                if tuning is not None:
+                    state |= {"source": tuning.name, "live": tuning.is_live, "frozen": tuning.frozen}
+                    state |= {"first": tuning.first, "end": tuning.end}
+                if tuning is not None and shown.look is not None:
+                    state["look"] = message_of(shown.look, tuning.is_live)
+                self._encoded = number, json.dumps(state)
+            return number, shown, self._encoded[1]
+
+    # --- one browser ---
+
+    def _talk(self, connection: Any) -> None:
+        """What a browser asks for, one thing after the other."""
+        seat = _Seat()
+        sender = threading.Thread(target=self._send_newest, args=(connection, seat), daemon=True)
+        sender.start()
+        try:
+            with suppress(self._closed):
+                for text in connection:
+                    self._take(seat, text)
+        finally:
+            with self._news:
+                seat.is_open = False
+                self._news.notify_all()
+            sender.join()
+
+    def _send_newest(self, connection: Any, seat: _Seat) -> None:
+        when = 0.0
+        with suppress(self._closed):
+            while True:
+                with self._news:
+                    self._news.wait_for(lambda: not seat.is_open or (seat.is_ready and self._version > seat.version))
+                    if not seat.is_open:
+                        return
+                    seat.is_ready = False
+                time.sleep(max(when + _SHORTEST_STEP - time.monotonic(), 0.0))
+                seat.version, shown, text = self._text_of_newest()
+                when = time.monotonic()
+                if shown.look is not None:
+                    seat.sent.append(shown.look)
+                done = seat.serial if shown.change >= seat.change else 0
+                connection.send(f'{{"done": {done}, "state": {text}}}')
+
+    def _take(self, seat: _Seat, text: str | bytes) -> None:
+        """Do what a message asks for, and look again."""
+        serial = 0
+        said: list[str] = []
+        trouble, asks = "", False
+        try:
+            asked = json.loads(text)
+            if asked["do"] == "shown":
+                with self._news:
+                    seat.is_ready = True
+                    self._news.notify_all()
+                return
+            serial = int(asked["serial"])
+            with self._acting:
+                said = self._do(asked, seat)
+        except _AlreadyThereError as error:
+            trouble, asks = str(error), True
+        except RopetraceError as error:
+            trouble = str(error)
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+            trouble = "this page and its server do not fit: load it again"
+        with self._news:
+            self._said, self._trouble, self._asks_to_replace = said, trouble, asks
+            self._change += 1
+            seat.change, seat.serial = self._change, serial
+            if self._shown.busy and self.tuning is not None:
+                # Whoever clicks while the kernels compile sees at once what was found.
+                self._show(replace(self._shown, change=self._change, look=self.tuning.glance()))
+            self._news.notify_all()
+
+    def _do(self, asked: Mapping[str, Any], seat: _Seat) -> list[str]:
+        """One thing that a page asks for; what is to be said of it."""
+        tuning, look = self.tuning, self._shown.look
+        if tuning is None or look is None:
+            raise ConfigError("the source is not open yet")
+        match asked["do"]:
+            case "click":
+                event = next((sent.event for sent in seat.sent if sent.index == asked["index"]), None)
+                return tuning.click(int(asked["column"]), int(asked["row"]), event)
+            case "measure":
+                return tuning.measure()
+            case "box":
+                tuning.put_box_round(look.cloud.points)
+            case "set":
+                tuning.change(asked["settings"])
+            case "go":
+                return [] if tuning.go_to(int(asked["index"])) else ["there is no such frame"]
+            case "freeze":
+                tuning.frozen = bool(asked["frozen"])
+            case "save":
+                return self._save(tuning, bool(asked["replace"]))
+            case _:
+                raise ValueError
+        return []
+
+    def _save(self, tuning: Tuning, may_replace: bool) -> list[str]:
+        if not tuning.knows_diameter:
+            raise ConfigError("the diameter is not known yet: click on the rope, or set it")
+        if self.file.is_of_others() and not may_replace:
+            raise _AlreadyThereError(f"{self.out} is there already: press 'replace' to write over it")
+        self.file.save(tuning.config.to_toml())
+        return [f"saved: ropetrace track {tuning.name} --config {self.out}"]
+
+    # --- who is let in ---
 
     def _answer(self, connection: Any, request: Any) -> Any:
         """The page, a refusal, or None to go on to the WebSocket."""
@@ -261,54 +490,17 @@ class TunePage:
             return connection.respond(HTTPStatus.NOT_FOUND, "there is one page here: /\n")
         return _page()
 
-    def _talk(self, connection: Any) -> None:
-        """What the page asks for, one thing after the other."""
-        if not self._seat.acquire(timeout=1):
-            connection.close(1013, "another page is open")
-            return
-        try:
-            self._send(connection, [], "")
-            for text in connection:
-                said, trouble = self._done(text)
-                self._send(connection, said, trouble)
-        finally:
-            self._seat.release()
 
-    def _done(self, text: str | bytes) -> tuple[list[str], str]:
-        """Do what a message asks for; what is to be said of it, and what went wrong."""
-        try:
-            return _do(self.tuning, json.loads(text), self.out), ""
-        except RopetraceError as error:
-            return [], str(error)
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
-            return [], "this page and its server do not fit: load it again"
-
-    def _send(self, connection: Any, said: list[str], trouble: str) -> None:
-        try:
-            state: dict[str, Any] = message_of(self.tuning, self.tuning.look())
-        except RopetraceError as error:
-            state, trouble = {}, trouble or str(error)
-        connection.send(json.dumps({**state, "said": said, "trouble": trouble, "out": self.out.name}))
+class _AlreadyThereError(OutputError):
+    """A file of somebody else would be written over."""
 
 
-def _do(tuning: Tuning, asked: Mapping[str, Any], out: Path) -> list[str]:
-    """One thing that the page asks for; what is to be said of it."""
-    match asked["do"]:
-        case "click":
-            return tuning.click(int(asked["column"]), int(asked["row"]))
-        case "measure":
-            return tuning.measure()
-        case "set":
-            tuning.change(asked["settings"])
-            return []
-        case "go":
-            return [] if tuning.go_to(int(asked["index"])) else ["there is no such frame"]
-        case "save":
-            if not tuning.knows_diameter:
-                raise ConfigError("the diameter is not known yet: click on the rope, or set it")
-            save_settings(tuning.config.to_toml(), out)
-            return [f"saved: ropetrace track RECORDING --config {out}"]
-    raise ValueError
+def _looked(tuning: Tuning) -> tuple[Look, str]:
+    """What the settings make of the frame; or the frame alone, and why nothing can be made of it."""
+    try:
+        return tuning.look(), ""
+    except RopetraceError as error:
+        return tuning.glance(), str(error)
 
 
 def _page() -> Any:
