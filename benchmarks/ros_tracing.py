@@ -98,20 +98,20 @@ class Watcher:
                 self._read()
             self._step += 1
         if self._phase in PHASES[:2] and now - self._since > LONGEST:
-            self._end("too slow", now)
+            self._end("too slow")
 
     def _enter(self, phase: str, now: float) -> None:
         before, self._phase = self._phase, phase
         if phase == before:
             return
-        if phase == "approaching":
+        if phase in PHASES[:2] and before not in PHASES[:2]:
             self._since = now
-        elif phase == "tracing":
+        if phase == "tracing":
             self._step, self._farthest = 0, 0.0
-        elif before in PHASES[:2]:
-            self._end(phase, now)
+        elif phase in PHASES[2:] and before in PHASES[:2]:
+            self._end(phase)
 
-    def _end(self, outcome: str, now: float) -> None:
+    def _end(self, outcome: str) -> None:
         if self._phase != "approaching":
             self._read()
         self._wind.outcomes.append(outcome)
@@ -237,9 +237,10 @@ def main() -> None:
 
 def _line(wind: Wind) -> str:
     done = wind.outcomes.count("done")
+    failed = ", ".join(outcome for outcome in wind.outcomes if outcome != "done")
     told = {text: wind.told.count(text) for text in dict.fromkeys(wind.told)}
     notes = "; ".join(f"{count} x {text}" for text, count in list(told.items())[:6])
-    return f"{wind.frequency:g} Hz: {done} of {len(wind.outcomes)} done; told: {notes or 'nothing'}"
+    return f"{wind.frequency:g} Hz: {done} of {len(wind.outcomes)} done{f' ({failed})' if failed else ''}; told: {notes or 'nothing'}"
 
 
 def _report(winds: list[Wind], running: list[Process], used: list[float], took: float) -> None:

@@ -30,17 +30,7 @@ from ropetrace.recordings import open_recording
 from ropetrace.recordings.ros1_bag import Ros1Bag
 from ropetrace.recordings.ros_frames import frame_messages
 from ropetrace.recordings.ros_messages import CAMERA, CLOUD, IMAGE, RawMessage, decoded
-from ropetrace.results.ros_estimates import (
-    DIAGNOSTICS,
-    PATH,
-    TRAJECTORY,
-    diagnostics,
-    header,
-    path,
-    pose_array,
-    trajectory,
-    typestore,
-)
+from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, diagnostics, header, typestore
 from ropetrace.ros import messages
 from ropetrace.ros.messages import JOINTS, NUMBERS, POSES
 from ropetrace.ros.rospy_graph import definition, master_uri, ros1_bytes, ros1_type
@@ -48,6 +38,7 @@ from ropetrace.ros.simulated_cell import cell_config
 from ropetrace.sim.scenario import SimulatedScene
 from ropetrace.types import CloudFrame, Frame, Intrinsics, Motion, RgbdFrame, Status, Waypoints
 from ros_rig import children_of, free_port, listening, runs, until
+from ros_twins import path, pose_array, trajectory
 
 DEBIAN_PYTHON, DEBIAN_PACKAGES = "/usr/bin/python3", "/usr/lib/python3/dist-packages"
 

@@ -24,7 +24,7 @@ from ropetrace.evaluation.metrics import symmetric_mean
 from ropetrace.motion import make_motion
 from ropetrace.recordings.ros_frames import CLOUD_TOPIC, COLOR_TOPIC, DEPTH_TOPIC, frame_messages
 from ropetrace.recordings.ros_messages import CLOUD, IMAGE, RawMessage, decoded, stamp_and_frame
-from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, header, make, path, trajectory, typestore
+from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, header, make, typestore
 from ropetrace.ros import messages
 from ropetrace.ros.graph import Publisher, Subscription
 from ropetrace.ros.kinematic_system import ArmSettings, KinematicSystem, ReceivedMotion, position_at
@@ -39,6 +39,7 @@ from ropetrace.sim.scenario import CLUTTER, ROBOT_COLOR, SimulatedScene
 from ropetrace.sim.scene import Capsules
 from ropetrace.types import BadFrame, CloudFrame, FloatArray, Frame, Motion, RgbdFrame, Waypoints, moved
 from ros_rig import routed, until
+from ros_twins import path, trajectory
 
 PANDA = Arm.named("panda")
 START = np.array(PLACEMENTS["behind"].start)
@@ -451,7 +452,12 @@ def test_joints_are_carried_on_from_their_stamp(age: float, velocity: float | No
 def test_the_newest_frame_or_every_one(scene: tuple[RgbdFrame, FloatArray], in_order: bool) -> None:
     with graph() as (node, beside):
         camera, sender = LiveCamera(node, CameraTopics(), True, in_order=in_order), Sender(beside)
-        until(lambda: sender.send(scene[0]) or camera.take() is not None)
+
+        def seen_one() -> bool:
+            sender.send(scene[0])
+            return camera.take() is not None
+
+        until(seen_one)
         time.sleep(0.1)
         while camera.take() is not None:
             """Those of the beginning."""

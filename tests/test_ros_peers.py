@@ -14,21 +14,12 @@ import numpy as np
 import pytest
 
 from ropetrace.recordings.ros_frames import frame_messages
-from ropetrace.results.ros_estimates import (
-    DIAGNOSTICS,
-    PATH,
-    TRAJECTORY,
-    diagnostics,
-    header,
-    path,
-    pose_array,
-    trajectory,
-    typestore,
-)
+from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, diagnostics, header, typestore
 from ropetrace.ros import messages
 from ropetrace.ros.messages import JOINTS, NUMBERS, POSES
 from ropetrace.types import CloudFrame, Frame, Intrinsics, Motion, RgbdFrame, Status, Waypoints
 from ros_rig import routed, until
+from ros_twins import path, pose_array, trajectory
 
 ROWS = np.arange(15.0).reshape(5, 3)
 WAYPOINTS = Waypoints(ROWS, np.tile([0.5, 0.5, 0.5, 0.5], (5, 1)), np.arange(5.0))

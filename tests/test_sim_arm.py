@@ -127,3 +127,20 @@ def test_impossible_commands_are_refused(panda: Arm, velocity: FloatArray) -> No
     moving = ArmSimulation(panda, START, base())
     with pytest.raises(ValueError, match="7 finite numbers"):
         moving.advance(0.1, velocity)
+
+
+def test_an_arm_that_is_restarted_is_as_new(panda: Arm) -> None:
+    def moved(simulation: ArmSimulation) -> FloatArray:
+        for step in range(1, 60):
+            simulation.advance(step / 240, np.linspace(-0.3, 0.3, simulation.arm.count))
+        return simulation.position
+
+    fresh, used = (ArmSimulation(panda, START, np.eye(4)) for _ in range(2))
+    moved(used)
+    used.restart(START)
+    assert used.time == 0
+    np.testing.assert_array_equal(used.position, START)
+    assert not used.velocity.any()
+    np.testing.assert_array_equal(moved(used), moved(fresh))
+    with pytest.raises(ConfigError, match="joints"):
+        used.restart(START[:3])

@@ -182,7 +182,14 @@ def color_image(message: RawMessage) -> NDArray[np.uint8]:
     if places is None:
         raise FrameError(f"encoding {body.encoding!r} is not colour: expected {', '.join(COLOR_ENCODINGS)}")
     channels = 4 if "a" in body.encoding else 3
-    return np.ascontiguousarray(_pixels(body, np.dtype(np.uint8), channels)[:, :, places])
+    pixels = _pixels(body, np.dtype(np.uint8), channels)
+    if body.encoding == "rgb8":
+        return pixels
+    # Channel by channel: an index of all three takes eight times as long.
+    ordered = np.empty((*pixels.shape[:2], 3), np.uint8)
+    for channel, place in enumerate(places):
+        ordered[:, :, channel] = pixels[:, :, place]
+    return ordered
 
 
 def _pixels(image: Any, kind: np.dtype[Any], channels: int) -> NDArray[Any]:

@@ -17,12 +17,11 @@ from ropetrace.results.ros_estimates import (
     TRAJECTORY,
     estimate_status,
     header,
-    path,
     topic_of,
-    trajectory,
     typestore,
     waypoint_cloud,
 )
+from ropetrace.results.ros_packed import pack_path, pack_trajectory
 from ropetrace.types import Cloud, Estimate, Frame
 
 METADATA = "ropetrace"
@@ -89,17 +88,16 @@ class EstimateMessages:
         for name, time_ns in (("stamp", stamp_ns), ("predicted time", held_ns)):
             if not 0 <= time_ns <= LAST_STAMP:
                 raise FrameError(f"the {name} {time_ns} ns does not fit a ROS time")
-        held = header(held_ns, self._frame_id)
+        frame_id, waypoints = self._frame_id, estimate.waypoints
+        status = estimate_status(header(stamp_ns, frame_id), estimate)
         messages = [
-            ("centerline", path(held, estimate.waypoints), PATH),
-            ("motion", trajectory(held, estimate.waypoints, estimate.motion), TRAJECTORY),
-            ("status", estimate_status(header(stamp_ns, self._frame_id), estimate), DIAGNOSTICS),
+            ("centerline", PATH, pack_path(held_ns, frame_id, waypoints)),
+            ("motion", TRAJECTORY, pack_trajectory(held_ns, frame_id, waypoints, estimate.motion)),
+            ("status", DIAGNOSTICS, typestore().serialize_cdr(status, DIAGNOSTICS)),
         ]
         if estimate.seen is not None or estimate.position_sigma is not None:
             self._with_cloud.add(rope)
         if rope in self._with_cloud:
-            messages.append(("waypoints", waypoint_cloud(held, estimate), CLOUD))
-        return [
-            RawMessage(topic_of(rope, topic), kind, "cdr", stamp_ns, typestore().serialize_cdr(message, kind))
-            for topic, message, kind in messages
-        ]
+            cloud = waypoint_cloud(header(held_ns, frame_id), estimate)
+            messages.append(("waypoints", CLOUD, typestore().serialize_cdr(cloud, CLOUD)))
+        return [RawMessage(topic_of(rope, topic), kind, "cdr", stamp_ns, data) for topic, kind, data in messages]

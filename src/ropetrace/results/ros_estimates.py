@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from ropetrace.results.base import rope_name
-from ropetrace.types import Estimate, FloatArray, Motion, Status, Waypoints
+from ropetrace.types import Estimate, Status
 
 TOPICS = "/ropetrace"
 """What the topics of the first rope begin with; those of another have its name after it."""
@@ -45,62 +45,6 @@ def topic_of(rope: int, topic: str) -> str:
 def header(stamp_ns: int, frame_id: str) -> Any:
     """A std_msgs/Header; the stamp is 0 to `LAST_STAMP` nanoseconds."""
     return make("std_msgs/msg/Header", make("builtin_interfaces/msg/Time", *divmod(stamp_ns, NANOSECONDS)), frame_id)
-
-
-def pose(position: list[float], quaternion: list[float]) -> Any:
-    """A geometry_msgs/Pose from metres and ``xyzw``."""
-    return make(
-        "geometry_msgs/msg/Pose",
-        make("geometry_msgs/msg/Point", *position),
-        make("geometry_msgs/msg/Quaternion", *quaternion),
-    )
-
-
-def path(held: Any, waypoints: Waypoints) -> Any:
-    """A nav_msgs/Path of the waypoints; without poses where there are none."""
-    return make(
-        PATH,
-        held,
-        [make("geometry_msgs/msg/PoseStamped", held, pose(row[:3], row[3:])) for row in _pose_rows(waypoints)],
-    )
-
-
-def pose_array(held: Any, waypoints: Waypoints) -> Any:
-    """A geometry_msgs/PoseArray of the waypoints."""
-    return make("geometry_msgs/msg/PoseArray", held, [pose(row[:3], row[3:]) for row in _pose_rows(waypoints)])
-
-
-def _pose_rows(waypoints: Waypoints) -> list[list[float]]:
-    rows: list[list[float]] = np.hstack((waypoints.positions, waypoints.quaternions)).tolist()
-    return rows
-
-
-def trajectory(held: Any, waypoints: Waypoints, motion: Motion | None) -> Any:
-    """A trajectory_msgs/MultiDOFJointTrajectory: one point of poses, velocities and accelerations, a joint a waypoint.
-
-    Where the motion is not known there is no joint and no point.
-    """
-    if motion is None or not len(motion):
-        return make(TRAJECTORY, held, [], [])
-
-    def vector(row: list[float]) -> Any:
-        return make("geometry_msgs/msg/Vector3", *row)
-
-    def twists(rows: FloatArray) -> list[Any]:
-        still = vector([0.0, 0.0, 0.0])
-        return [make("geometry_msgs/msg/Twist", vector(row), still) for row in rows.tolist()]
-
-    point = make(
-        "trajectory_msgs/msg/MultiDOFJointTrajectoryPoint",
-        [
-            make("geometry_msgs/msg/Transform", vector(row[:3]), make("geometry_msgs/msg/Quaternion", *row[3:]))
-            for row in _pose_rows(waypoints)
-        ],
-        twists(motion.velocities),
-        twists(motion.accelerations),
-        make("builtin_interfaces/msg/Duration", 0, 0),
-    )
-    return make(TRAJECTORY, held, [f"waypoint_{number}" for number in range(len(waypoints))], [point])
 
 
 def waypoint_cloud(held: Any, estimate: Estimate) -> Any:

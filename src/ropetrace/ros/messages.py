@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from ropetrace.errors import FrameError
 from ropetrace.recordings.ros_messages import RawMessage, decoded
 from ropetrace.results.ros_estimates import NANOSECONDS, make
+from ropetrace.results.ros_packed import unpack_path, unpack_trajectory
 from ropetrace.types import FloatArray, Motion, Waypoints
 
 POSES = "geometry_msgs/msg/PoseArray"
@@ -52,12 +54,11 @@ def waypoints(message: RawMessage) -> Waypoints:
     FrameError
         If it is damaged, has one pose only, too many, or one that is not finite.
     """
-    poses = [stamped.pose for stamped in decoded(message).poses]
-    return _waypoints(
-        message.topic,
-        [(p.position.x, p.position.y, p.position.z) for p in poses],
-        [(p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w) for p in poses],
-    )
+    poses = unpack_path(message.data) if message.encoding == "cdr" else None
+    if poses is None:
+        body = [stamped.pose for stamped in decoded(message).poses]
+        poses = _rows((p.position, p.orientation) for p in body)
+    return _waypoints(message.topic, poses)
 
 
 def moving_waypoints(message: RawMessage) -> tuple[Waypoints, Motion] | None:
@@ -68,22 +69,28 @@ def moving_waypoints(message: RawMessage) -> tuple[Waypoints, Motion] | None:
     Raises
     ------
     FrameError
-        If it is damaged or not as `results.ros_estimates.trajectory` makes it.
+        If it is damaged or not as `results.ros_packed.pack_trajectory` makes it.
     """
-    body = decoded(message)
-    if not body.points:
+    known = unpack_trajectory(message.data) if message.encoding == "cdr" else None
+    if known is None:
+        body = decoded(message)
+        if not body.points:
+            return None
+        point = body.points[0]
+        velocities, accelerations = (
+            np.array([(t.linear.x, t.linear.y, t.linear.z) for t in twists], float).reshape(-1, 3)
+            for twists in (point.velocities, point.accelerations)
+        )
+        known = _rows((t.translation, t.rotation) for t in point.transforms), velocities, accelerations
+    poses, velocities, accelerations = known
+    if not len(poses):
         return None
-    point = body.points[0]
-    places = [(t.translation.x, t.translation.y, t.translation.z) for t in point.transforms]
-    turns = [(t.rotation.x, t.rotation.y, t.rotation.z, t.rotation.w) for t in point.transforms]
-    found = _waypoints(message.topic, places, turns)
-    velocities = np.array([(t.linear.x, t.linear.y, t.linear.z) for t in point.velocities]).reshape(-1, 3)
-    accelerations = np.array([(t.linear.x, t.linear.y, t.linear.z) for t in point.accelerations]).reshape(-1, 3)
-    if not len(found) == len(velocities) == len(accelerations):
+    if not len(poses) == len(velocities) == len(accelerations):
         raise FrameError(
-            f"{message.topic}: {len(found)} poses, {len(velocities)} velocities and {len(accelerations)} "
+            f"{message.topic}: {len(poses)} poses, {len(velocities)} velocities and {len(accelerations)} "
             "accelerations do not fit"
         )
+    found = _waypoints(message.topic, poses)
     if not (np.isfinite(velocities).all() and np.isfinite(accelerations).all()):
         raise FrameError(f"{message.topic}: a velocity or an acceleration is not finite")
     unknown = np.full(velocities.shape, np.nan)
@@ -132,13 +139,19 @@ def joint_values(message: RawMessage, names: tuple[str, ...], of: str) -> FloatA
     return found
 
 
-def _waypoints(topic: str, positions: list[Any], quaternions: list[Any]) -> Waypoints:
-    if not positions:
+def _rows(poses: Iterable[tuple[Any, Any]]) -> FloatArray:
+    """Positions and quaternions, (W, 7)."""
+    rows = [(at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w) for at, turn in poses]
+    return np.array(rows, float).reshape(-1, 7)
+
+
+def _waypoints(topic: str, poses: FloatArray) -> Waypoints:
+    if not len(poses):
         return Waypoints.none()
-    places, turns = np.array(positions, float), np.array(quaternions, float)
-    if not 2 <= len(places) <= MOST_WAYPOINTS:
-        raise FrameError(f"{topic}: {len(places)} poses: expected none, or 2 to {MOST_WAYPOINTS}")
-    if not (np.isfinite(places).all() and np.isfinite(turns).all()):
+    if not 2 <= len(poses) <= MOST_WAYPOINTS:
+        raise FrameError(f"{topic}: {len(poses)} poses: expected none, or 2 to {MOST_WAYPOINTS}")
+    if not np.isfinite(poses).all():
         raise FrameError(f"{topic}: a pose is not finite")
+    places = np.ascontiguousarray(poses[:, :3])
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    return Waypoints(places, turns, np.concatenate(([0.0], np.cumsum(steps))))
+    return Waypoints(places, np.ascontiguousarray(poses[:, 3:]), np.concatenate(([0.0], np.cumsum(steps))))

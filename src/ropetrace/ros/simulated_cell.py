@@ -112,12 +112,13 @@ class SimulatedCell:
         self._reporter = Reporter(node)
         self._warm_up = settings.warm_up
         self._now = 0.0
+        self._start = np.array(PLACEMENTS["behind"].start)
+        self.moving = ArmSimulation(self._arm, self._start, PLACEMENTS["behind"].world_from_base())
         self.put_back()
 
     def put_back(self) -> None:
         """Put the arm back to where it started; for `ARM_AWAY` it says nothing and does not move."""
-        placement = PLACEMENTS["behind"]
-        self.moving = ArmSimulation(self._arm, np.array(placement.start), placement.world_from_base())
+        self.moving.restart(self._start)
         self._arm_start = self._now
         self._away_until = self._now + ARM_AWAY
         self._velocity = np.zeros(self._arm.count)

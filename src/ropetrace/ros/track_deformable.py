@@ -8,7 +8,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ropetrace.config import RopeConfig
-from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, estimate_status, header, path, pose_array, topic_of
+from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, estimate_status, header, topic_of
+from ropetrace.results.ros_packed import pack_path, pack_poses
 from ropetrace.ros.graph import Publisher, RosNode
 from ropetrace.ros.live_camera import CameraTopics, LiveCamera, Seen
 from ropetrace.ros.messages import POSES
@@ -88,10 +89,10 @@ class TrackDeformable:
         untimely = from_the_future(seen.event.stamp_ns, time.time_ns())
         for estimate in estimates:
             told = with_reason(estimate, untimely) if untimely else estimate
-            held, outputs = header(told.stamp_ns, seen.frame_id), self._output(told.rope)
-            outputs["centerline"].put(path(held, told.waypoints))
-            outputs["poses"].put(pose_array(held, told.waypoints))
-            outputs["status"].put(estimate_status(held, told))
+            outputs = self._output(told.rope)
+            outputs["centerline"].put_packed(pack_path(told.stamp_ns, seen.frame_id, told.waypoints))
+            outputs["poses"].put_packed(pack_poses(told.stamp_ns, seen.frame_id, told.waypoints))
+            outputs["status"].put(estimate_status(header(told.stamp_ns, seen.frame_id), told))
         reasons = [reason for estimate in estimates for reason in estimate.reasons]
         worst = max((estimate.status for estimate in estimates), key=list(Status).index)
         if (untimely or problem) and worst is Status.OK:

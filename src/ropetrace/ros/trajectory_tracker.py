@@ -10,7 +10,8 @@ from ropetrace.config import RopeConfig
 from ropetrace.errors import ConfigError, FrameError
 from ropetrace.motion import make_motion
 from ropetrace.recordings.ros_messages import RawMessage, stamp_and_frame
-from ropetrace.results.ros_estimates import PATH, TRAJECTORY, header, path, topic_of, trajectory
+from ropetrace.results.ros_estimates import PATH, TRAJECTORY, topic_of
+from ropetrace.results.ros_packed import pack_path, pack_trajectory
 from ropetrace.ros import messages
 from ropetrace.ros.graph import RosNode
 from ropetrace.ros.reporting import Reporter
@@ -79,7 +80,7 @@ class TrajectoryTracker:
         motion = self._motion.update(stamp_ns, waypoints)
         if motion is None:
             return Status.DEGRADED, "the motion is not known yet"
-        self._moving.put(trajectory(header(stamp_ns, frame_id), waypoints, motion))
+        self._moving.put_packed(pack_trajectory(stamp_ns, frame_id, waypoints, motion))
         now_ns = time.time_ns()
         untimely = from_the_future(stamp_ns, now_ns)
         if untimely:
@@ -88,5 +89,5 @@ class TrajectoryTracker:
         prediction = self._motion.predict(max(ahead, 0.0)) if ahead <= LONGEST_PREDICTION else None
         if prediction is None:
             return Status.DEGRADED, f"the path is {ahead:.2f} s old: too old to be predicted"
-        self._predicted.put(path(header(now_ns, frame_id), waypoints_through(prediction[0], waypoints)))
+        self._predicted.put_packed(pack_path(now_ns, frame_id, waypoints_through(prediction[0], waypoints)))
         return Status.OK, "following"

@@ -46,16 +46,6 @@ class ArmSimulation:
 
     def __init__(self, arm: Arm, position: FloatArray, world_from_base: FloatArray) -> None:
         mujoco = import_extra("mujoco", "sim")
-        start = np.asarray(position, float)
-        if start.shape != (arm.count,) or not np.isfinite(start).all():
-            raise ConfigError(f"the arm {arm.name} has {arm.count} joints: a position of {start} is none of it")
-        outside = np.flatnonzero((start < arm.limits.lower) | (start > arm.limits.upper))
-        if len(outside):
-            joint = outside[0]
-            raise ConfigError(
-                f"the arm {arm.name} cannot start with joint {joint + 1} at {start[joint]:g} rad: its range is "
-                f"{arm.limits.lower[joint]:g} to {arm.limits.upper[joint]:g} rad"
-            )
         self.arm = arm
         self.world_from_base = np.array(world_from_base, float)
         self._mujoco = mujoco
@@ -81,8 +71,7 @@ class ArmSimulation:
         self._data = mujoco.MjData(physics)
         self._joints = np.array([physics.joint(name).qposadr[0] for name in arm.joint_names])
         self._dofs = np.array([physics.joint(name).dofadr[0] for name in arm.joint_names])
-        self._data.qpos[self._joints] = start
-        mujoco.mj_forward(physics, self._data)
+        self.restart(position)
         mass = np.zeros((physics.nv, physics.nv))
         mujoco.mj_fullM(physics, self._data, mass)
         gains = np.diag(mass)[self._dofs] / RESPONSE
@@ -90,7 +79,30 @@ class ArmSimulation:
         physics.actuator_biasprm[0::2, 2] = -gains
         physics.actuator_gainprm[1::2, 0] = gains / INTEGRAL_TIME
         physics.actuator_biasprm[1::2, 1] = -gains / INTEGRAL_TIME
+
+    def restart(self, position: FloatArray) -> None:
+        """Stand still at a position, at time 0.
+
+        Raises
+        ------
+        ConfigError
+            If the position is impossible.
+        """
+        arm = self.arm
+        start = np.asarray(position, float)
+        if start.shape != (arm.count,) or not np.isfinite(start).all():
+            raise ConfigError(f"the arm {arm.name} has {arm.count} joints: a position of {start} is none of it")
+        outside = np.flatnonzero((start < arm.limits.lower) | (start > arm.limits.upper))
+        if len(outside):
+            joint = outside[0]
+            raise ConfigError(
+                f"the arm {arm.name} cannot start with joint {joint + 1} at {start[joint]:g} rad: its range is "
+                f"{arm.limits.lower[joint]:g} to {arm.limits.upper[joint]:g} rad"
+            )
+        self._mujoco.mj_resetData(self._physics, self._data)
+        self._data.qpos[self._joints] = start
         self._data.act[:] = start
+        self._mujoco.mj_forward(self._physics, self._data)
         self._step = 0
 
     @property
