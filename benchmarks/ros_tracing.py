@@ -62,7 +62,6 @@ class Wind:
     outcomes: list[str] = field(default_factory=list)
     traced: list[float] = field(default_factory=list)
     latencies: list[float] = field(default_factory=list)
-    images: int = 0
     told: list[str] = field(default_factory=list)
 
 
@@ -200,7 +199,6 @@ def watch(frequency: float, condition: str, seconds: float, running: list[Proces
                     one.sample()
 
         cell.run(lambda: time.monotonic() > end, tick)
-        wind.images = round(seconds * cell.simulated.camera.rate)
     return wind
 
 
@@ -237,10 +235,10 @@ def main() -> None:
 
 def _line(wind: Wind) -> str:
     done = wind.outcomes.count("done")
-    failed = ", ".join(outcome for outcome in wind.outcomes if outcome != "done")
+    failed = "".join(f", {outcome}" for outcome in wind.outcomes if outcome != "done")
     told = {text: wind.told.count(text) for text in dict.fromkeys(wind.told)}
     notes = "; ".join(f"{count} x {text}" for text, count in list(told.items())[:6])
-    return f"{wind.frequency:g} Hz: {done} of {len(wind.outcomes)} done{f' ({failed})' if failed else ''}; told: {notes or 'nothing'}"
+    return f"{wind.frequency:g} Hz: {done} of {len(wind.outcomes)} done{failed}; told: {notes or 'nothing'}"
 
 
 def _report(winds: list[Wind], running: list[Process], used: list[float], took: float) -> None:
@@ -258,7 +256,6 @@ def _report(winds: list[Wind], running: list[Process], used: list[float], took: 
                 f"{linear.max():.2f}" if len(linear) else "",
                 f"{angular.mean():.3f} ± {angular.std():.3f}" if len(angular) else "",
                 "{:.1f} / {:.1f}".format(*np.percentile(wind.latencies, [50, 99])),
-                f"{len(wind.latencies)} of {wind.images}",
             ]
         )
     print(
@@ -272,7 +269,6 @@ def _report(winds: list[Wind], running: list[Process], used: list[float], took: 
                 "worst",
                 "angular, rad",
                 "latency p50 / p99, ms",
-                "images used",
             ),
             rows,
         )
