@@ -5,9 +5,10 @@
 
 This process is the camera and the arm, in real time: images and joints go out over Zenoh, joint commands come back. The
 rope sways in each of case study 2's winds for a ninth of the time; whenever the arm has come to the end it is put back
-and begins anew. Printed are the errors of the tool beside those of the same tracings inside one process and without a
-clock (`ropetrace reproduce case2`), the time from an image's stamp to the arrival of the first joint command that rests
-on it, the tracings, and the memory and processor time of each node.
+and begins anew. Printed are the tracings and the errors of the tool; beside them those inside one process and without a
+clock, as `ropetrace reproduce case2` has them, with the tracker's own latency and with that of the nodes; the time from
+an image's stamp to the arrival of the first joint command that rests on it, and how much of it the simulated camera
+takes; and the memory and processor time of each node.
 """
 
 from __future__ import annotations
@@ -21,14 +22,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ropetrace.evaluation.case1 import CONDITIONS, FREQUENCIES
-from ropetrace.evaluation.case2 import CONTROL_RATE, TOOL_TURN, ToolErrors, tool_errors
+from ropetrace.evaluation.case1 import CONDITIONS, FREQUENCIES, Condition, measure_compute_time
+from ropetrace.evaluation.case2 import CONTROL_RATE, TOOL_TURN, Case2Settings, ToolErrors, run_tracing, tool_errors
 from ropetrace.evaluation.tables import markdown_table
-from ropetrace.recordings.ros_messages import decoded, stamp_and_frame
+from ropetrace.recordings.ros_frames import DEPTH_TOPIC
+from ropetrace.recordings.ros_messages import CAMERA, decoded, stamp_and_frame
 from ropetrace.results.ros_estimates import DIAGNOSTICS, NANOSECONDS
+from ropetrace.ros.live_camera import camera_info_beside
 from ropetrace.ros.messages import JOINTS, TIME
 from ropetrace.ros.simulated_cell import CellSettings, SimulatedCell, cell_config
 from ropetrace.ros.zenoh_graph import ZenohNode
@@ -50,6 +54,8 @@ WARM_UP = 10.0
 MEMORY_EVERY = 5.0
 """Seconds."""
 
+_CONDITIONS = {condition.name: condition for condition in CONDITIONS}
+
 PHASES = ("approaching", "tracing", "done", "fell off", "stuck")
 
 
@@ -62,6 +68,7 @@ class Wind:
     outcomes: list[str] = field(default_factory=list)
     traced: list[float] = field(default_factory=list)
     latencies: list[float] = field(default_factory=list)
+    camera: list[float] = field(default_factory=list)
     told: list[str] = field(default_factory=list)
 
 
@@ -74,6 +81,7 @@ class Watcher:
         self._commands = node.subscription("/ropetrace/joint_commands", JOINTS, depth=1000)
         self._basis = node.subscription("/ropetrace/command_basis", TIME, depth=1000)
         self._told = node.subscription("/diagnostics", DIAGNOSTICS, depth=100)
+        self._shown = node.subscription(camera_info_beside(DEPTH_TOPIC), CAMERA, depth=100)
         self._arrivals: dict[int, int] = {}
         self._images: dict[int, int] = {}
         self._known: set[int] = set()
@@ -125,7 +133,8 @@ class Watcher:
             self._farthest = max(self._farthest, errors.place)
 
     def _latency(self) -> None:
-        """From each image's stamp to the first command that rests on it."""
+        """From each image's stamp to the first command that rests on it, and to where the camera hands it on."""
+        self._wind.camera += [(one.log_time_ns - stamp_and_frame(one)[0]) / 1e6 for one in self._shown.take()]
         for message in self._commands.take():
             self._arrivals[stamp_and_frame(message)[0]] = message.log_time_ns
         for message in self._basis.take():
@@ -205,7 +214,7 @@ def watch(frequency: float, condition: str, seconds: float, running: list[Proces
 def main() -> None:
     """Measure, and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--condition", choices=[condition.name for condition in CONDITIONS], default="30fps")
+    parser.add_argument("--condition", choices=list(_CONDITIONS), default="30fps")
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--frequencies", type=float, nargs="+", default=FREQUENCIES)
     options = parser.parse_args()
@@ -228,7 +237,7 @@ def main() -> None:
                 took = time.monotonic() - began
                 used = [one.cpu_seconds() - start for one, start in zip(running, before, strict=True)]
                 print()
-                _report(winds, running, used, took)
+                _report(winds, _CONDITIONS[options.condition], running, used, took)
         finally:
             router.close()
 
@@ -241,43 +250,33 @@ def _line(wind: Wind) -> str:
     return f"{wind.frequency:g} Hz: {done} of {len(wind.outcomes)} done{failed}; told: {notes or 'nothing'}"
 
 
-def _report(winds: list[Wind], running: list[Process], used: list[float], took: float) -> None:
-    rows = []
-    for wind in winds:
-        linear = np.array([errors.linear for errors in wind.readings]) * 1e3
-        angular = np.array([errors.angular for errors in wind.readings])
-        rows.append(
-            [
-                f"{wind.frequency:g}",
-                f"{wind.outcomes.count('done')} of {len(wind.outcomes)}",
-                f"{np.mean(wind.traced):.1%}" if wind.traced else "",
-                str(len(linear)),
-                f"{linear.mean():.3f} ± {linear.std():.3f}" if len(linear) else "",
-                f"{linear.max():.2f}" if len(linear) else "",
-                f"{angular.mean():.3f} ± {angular.std():.3f}" if len(angular) else "",
-                "{:.1f} / {:.1f}".format(*np.percentile(wind.latencies, [50, 99])),
-            ]
-        )
-    print(
-        markdown_table(
-            (
-                "wind, Hz",
-                "completed",
-                "traced",
-                "readings",
-                "linear, mm",
-                "worst",
-                "angular, rad",
-                "latency p50 / p99, ms",
-            ),
-            rows,
-        )
-    )
+def _report(winds: list[Wind], condition: Condition, running: list[Process], used: list[float], took: float) -> None:
     every = np.concatenate([wind.latencies for wind in winds])
     p50, p99, p999 = np.percentile(every, [50, 99, 99.9])
+    settings = Case2Settings()
+    own = measure_compute_time(condition, settings.as_case1()) / condition.speed
+    delays = {f"in process, {own * 1e3:.1f} ms": own, f"in process, {p50:.1f} ms": p50 / 1e3 - 0.5 / CONTROL_RATE}
+    rows = []
+    for wind in winds:
+        row = [
+            f"{wind.frequency:g}",
+            f"{wind.outcomes.count('done')} of {len(wind.outcomes)}",
+            f"{np.mean(wind.traced):.1%}" if wind.traced else "",
+            str(len(wind.readings)),
+            *_errors([errors.linear for errors in wind.readings], [errors.angular for errors in wind.readings]),
+        ]
+        for delay in delays.values():
+            runs = [run_tracing(condition, wind.frequency, settings, delay, repeat) for repeat in range(3)]
+            row.append(_errors(np.concatenate([run.linear for run in runs]), [0.0])[0])
+            if not all(run.completed for run in runs):
+                row[-1] += f" ({sum(run.completed for run in runs)} of 3)"
+        rows.append(row)
+    header = ("wind, Hz", "completed", "traced", "readings", "linear, mm", "worst", "angular, rad", *delays)
+    print(markdown_table(header, rows))
+    camera = np.percentile(np.concatenate([wind.camera for wind in winds]), [50, 99])
     print(
-        f"image to joint command: p50 {p50:.1f} ms, p99 {p99:.1f} ms, p99.9 {p999:.1f} ms, "
-        f"greatest {every.max():.1f} ms, {len(every)} images"
+        f"image to joint command: p50 {p50:.1f} ms, p99 {p99:.1f} ms, p99.9 {p999:.1f} ms, greatest {every.max():.1f} "
+        f"ms, {len(every)} images; the simulated camera's part: p50 {camera[0]:.1f} ms, p99 {camera[1]:.1f} ms"
     )
     for one, cpu in zip(running, used, strict=True):
         times, sizes = np.array(one.memory).T
@@ -287,6 +286,14 @@ def _report(winds: list[Wind], running: list[Process], used: list[float], took: 
             f"{one.name}: {cpu / took:.0%} of a core; memory {early:.1f} MB in the first fifth, {late:.1f} MB in the "
             f"last, {slope:+.2f} MB a minute"
         )
+
+
+def _errors(linear: Any, angular: Any) -> tuple[str, str, str]:
+    """Mean and deviation in mm, the worst, mean and deviation in rad."""
+    if not len(linear):
+        return "", "", ""
+    far, turned = np.array(linear) * 1e3, np.array(angular)
+    return f"{far.mean():.3f} ± {far.std():.3f}", f"{far.max():.2f}", f"{turned.mean():.3f} ± {turned.std():.3f}"
 
 
 if __name__ == "__main__":

@@ -35,6 +35,9 @@ MOST_BEHIND = 0.5
 """A simulation that is slower than real time by more is told, and its clock set, seconds."""
 
 
+_ROUNDING = 1e-9
+"""Stamps and steps are sums of fractions: without it a frame comes a step late, seconds."""
+
 _CONDITIONS = {condition.name: condition for condition in CONDITIONS}
 
 ARM_AWAY = 1.5
@@ -149,7 +152,7 @@ class SimulatedCell:
                 self._reporter.tell(Status.DEGRADED, f"slower than real time: {-ahead:.1f} s were left out")
             time.sleep(max(ahead, 0.0))
             self.moving.advance(now - self._arm_start, self._command())
-            if camera.stamp(frame) <= self._warm_up + now:
+            if camera.stamp(frame) <= self._warm_up + now + _ROUNDING:
                 self.simulated.robot = self.moving.capsules()
                 exposed = camera.expose(self.simulated.scene_at, camera.stamp(frame), frame)
                 stamp_ns = round((started + camera.stamp(frame) - self._warm_up) * 1e9)
