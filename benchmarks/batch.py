@@ -33,7 +33,7 @@ BROKEN = (3, 77, 150)
 
 
 def make_recordings(folder: Path, count: int, frames: int) -> None:
-    """Recordings in ten folders; the broken ones are no MCAP, cut off in the first frame, and of 0 bytes."""
+    """Recordings in ten folders; the broken ones are no MCAP, cut off after 4000 bytes, and of 0 bytes."""
     caster = RayCaster(CAMERA)
     images = []
     for index in range(frames):
@@ -62,11 +62,13 @@ def results(out: Path) -> dict[Path, int]:
 
 
 def kill_and_resume(recordings: Path, out: Path, count: int) -> None:
-    process = subprocess.Popen(command(recordings, out, 2), start_new_session=True, stderr=subprocess.PIPE)
+    process = subprocess.Popen(command(recordings, out, 2), start_new_session=True)
     while len(results(out)) < count // 2:
+        if process.poll() is not None:
+            sys.exit(f"the batch ended by itself, with exit code {process.returncode} and {len(results(out))} results")
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGKILL)
-    process.communicate()
+    process.wait()
     before = results(out)
     done = subprocess.run(command(recordings, out, 2), capture_output=True, text=True, check=False)
     after = results(out)

@@ -217,7 +217,7 @@ def kill_command(path: Path, rope: list[str]) -> tuple[int, list[int]]:
     os.close(theirs)
     shown, end = b"", float("inf")
     with process, suppress(OSError):
-        while time.monotonic() < end:
+        while process.poll() is None and time.monotonic() < end:
             if select.select([ours], [], [], 0.1)[0]:
                 shown += os.read(ours, 65536)
             if end == float("inf") and re.search(rb"[1-9]frame \[", shown):

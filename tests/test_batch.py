@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import importlib.util
 import os
 import re
@@ -12,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from ropetrace.batch import DiskFullError, Outcome, ResultFolder, Task, run_batc
 from ropetrace.config import RopeConfig
 from ropetrace.errors import OutputError, RecordingError
 from ropetrace.evaluation import workers
+from ropetrace.recorder import Recorder
 from ropetrace.recordings.find import find_recordings
 from test_cli import COLOR, Run, rope_frames, run, write_folder, write_mcap
 from test_recorder import small_file_system, wait_until
@@ -107,6 +109,52 @@ def test_a_folder_of_one_recording_is_one(tree: Path) -> None:
             find_recordings([str(tree / nothing)], tree / "out")
 
 
+def test_a_link_never_names_what_is_there_itself(tree: Path) -> None:
+    """Else the recordings of another day would count as finished when ``current`` points to it."""
+    (tree / "current").symlink_to("day2")
+    (tree / "day1" / "0").symlink_to("../day2/a.mcap")
+    (tree / "elsewhere").symlink_to(tree.parent / "other")
+    shutil.copytree(tree / "day1" / "a", tree.parent / "other" / "b")
+    out = tree.parent / "out"
+    for patterns in (["**"], [""], ["*"]):
+        found = find_recordings([str(tree / pattern) for pattern in patterns], out)
+        assert list(found.recordings) == [*ALL, "elsewhere/b"]
+    assert list(find_recordings([f"{tree}/*/*.mcap"], out).recordings) == ALL[2:]
+    assert list(find_recordings([f"{tree}/current"], out).recordings) == ["a.mcap", "broken.mcap", "cut.mcap"]
+
+
+def test_results_are_no_recordings(tree: Path) -> None:
+    out = tree / "out"
+    write_mcap(make_folder(out) / "a.mcap.mcap", rope_frames(1))
+    shutil.copytree(out, out / "day1")
+    (tree / "results").symlink_to(out)
+    for pattern in ("in/**", "in/*", "in/*/*", "in/**/*.mcap"):
+        found = find_recordings([str(tree.parent / pattern)], out)
+        assert not [name for name in found.recordings if "out" in name or "results" in name]
+    for pattern in ("out/*/*", "out/a.mcap.mcap", "results"):
+        with pytest.raises(RecordingError, match=r"no recording is there; the folder of results, .*, is left out"):
+            find_recordings([str(tree / pattern)], out)
+
+
+def test_what_cannot_be_searched_is_told_and_passed_over(run: Run, tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tree / "round").symlink_to("about")
+    (tree / "about").symlink_to("round")
+    listdir = os.listdir
+
+    def listed(path: Any) -> list[str]:
+        if Path(path).name == "day2":
+            raise PermissionError(13, "Permission denied")
+        return listdir(path)
+
+    monkeypatch.setattr(os, "listdir", listed)
+    code, out, err = run("batch", "in/**", "--out", "out", *ROPE, "--jobs", 1)
+    assert code == 0
+    assert "recordings 3 (3 finished" in out
+    assert err == f"{tree}/day2: cannot be searched: Permission denied\n"
+    code, _, err = run("batch", "in/round", "in/day2", "--out", "out", *ROPE)
+    assert (code, err) == (2, "ropetrace: in/round: no recording is there\n")
+
+
 def test_batch_goes_on_where_it_was(run: Run, tree: Path) -> None:
     code, out, err = run("batch", "in/**", "--out", "out", *ROPE, "--jobs", 2)
     assert code == 3
@@ -122,7 +170,7 @@ def test_batch_goes_on_where_it_was(run: Run, tree: Path) -> None:
     assert all(int(row["ok"]) + int(row["degraded"]) + int(row["lost"]) == int(row["frames"]) for row in table.values())
     before = results(out_folder)
     assert sorted(before) == sorted([*(f"{name}.csv" for name in ALL if "broken" not in name), "summary.csv"])
-    assert not list(out_folder.glob(".*"))
+    assert [path.name for path in out_folder.glob(".*")] == [".lock"]
 
     (out_folder / "day1" / "a.csv").unlink()
     with (out_folder / "summary.csv").open("a") as file:
@@ -142,7 +190,7 @@ def test_batch_goes_on_where_it_was(run: Run, tree: Path) -> None:
     (out_folder / "mine.txt").touch()
     code, out, _ = run("batch", "in/day1/*", "--out", "out", *ROPE, "--format", "npz", "--overwrite", "--jobs", 1)
     assert code == 0
-    assert sorted(path.name for path in out_folder.rglob("*.*")) == [
+    assert sorted(path.name for path in out_folder.rglob("[!.]*.*")) == [
         "a.mcap.npz", "a.npz", "a10.npz", "mine.txt", "settings.toml", "summary.csv",
     ]  # fmt: skip
 
@@ -155,6 +203,7 @@ def test_batch_refuses_in_one_line(run: Run, tree: Path) -> None:
         (("in/**", "--out", "out", "--diameter", "auto"), "auto and @COLUMN,ROW"),
         (("in/**", "--out", "in/day1/a/out", *ROPE), "lies in, the recording"),
         (("in/**", "--out", "in", *ROPE), "no recording is there"),
+        (("", "--out", "out", *ROPE), "an empty pattern"),
         (("in/x/**", "--out", "out", *ROPE), "no recording is there"),
         (("in/**", "--out", "in/notes.txt", *ROPE), "is a file"),
         (("in/**", "--out", "out", *ROPE, "--jobs", 0), "--jobs 0"),
@@ -176,23 +225,80 @@ def test_only_one_batch_writes_to_a_folder(tmp_path: Path) -> None:
     ResultFolder(tmp_path / "out", {"a": 1}, overwrite=False).__exit__(None, None, None)
 
 
+def test_the_lock_is_one_that_nfs_takes_and_no_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    modes = []
+    flock = fcntl.flock
+
+    def lock(file: Any, operation: int) -> None:
+        modes.append(fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE)
+        flock(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", lock)
+    (make_folder(tmp_path / "out") / ".lock").touch()  # of a run that was killed at once
+    ResultFolder(tmp_path / "out", {}, overwrite=False).__exit__(None, None, None)
+    assert modes == [os.O_RDWR]
+
+
+def test_folders_of_any_bytes_are_tracked(run: Run, tree: Path) -> None:
+    odd = tree / os.fsdecode(b"\xff\r\x7f")
+    shutil.copytree(tree / "day1", odd)
+    for finished in (0, 3):
+        code, out, err = run("batch", odd, "--out", "out", *ROPE, "--jobs", 1)
+        assert code == 0, err
+        assert f"recordings 3 (3 finished, {finished} of them before" in out
+
+
+def test_damage_without_an_end_leaves_a_summary_that_can_be_read(tmp_path: Path) -> None:
+    with ResultFolder(tmp_path / "out", {}, overwrite=False) as folder:
+        folder.add(Outcome("long", error="x" * 200_000))
+        (folder.parts / "r").touch()
+        folder.add(Outcome("good", 1, 1, 0, 0, 0.5, "r"))
+    assert 1000 < len(rows(tmp_path / "out")["long"]["error"]) < 10_000
+    with (tmp_path / "out" / "summary.csv").open("a") as file:
+        file.write(f"older,1,1,0,0,0.5,r,{'x' * 200_000}\nnext,1,1,0,0,0.5,r,\n")
+    with ResultFolder(tmp_path / "out", {}, overwrite=False) as folder:
+        assert list(folder.outcomes) == ["good", "next"]
+
+
+def test_the_summary_has_the_first_of_much_damage(tree: Path, tmp_path: Path) -> None:
+    starts = []
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for frame in rope_frames(12):
+            starts.append(recorder.size)
+            recorder.write(frame)
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    for start in starts[1:-1]:
+        data[start + 500] ^= 1
+    (tmp_path / "a.mcap").write_bytes(data)
+    error = track_task(task("a", tmp_path / "a.mcap"), make_folder(tmp_path / "parts")).error
+    assert error.count(" is damaged (") == 5
+    assert re.search(r"; and \d+ more$", error)
+
+
 def test_names_of_any_bytes_come_back(tmp_path: Path) -> None:
-    outcomes = [Outcome(os.fsdecode(b"\xff,\n\"'"), 1, 1, 0, 0, 0.5, "r", "two\nlines, and a comma")]
+    outcomes = [
+        Outcome(os.fsdecode(b"\xff,\n\"'"), 1, 1, 0, 0, 0.5, "r", "two\nlines, and a comma"),
+        Outcome("a\rb\r\n", 1, 1, 0, 0, 0.5, "r", "\r"),
+    ]
     (tmp_path / "out").mkdir()
     with ResultFolder(tmp_path / "out", {}, overwrite=True) as folder:
-        (folder.parts / "r").touch()
-        folder.add(outcomes[0])
+        for outcome in outcomes:
+            (folder.parts / "r").touch()
+            folder.add(outcome)
     with ResultFolder(tmp_path / "out", {}, overwrite=False) as folder:
         assert list(folder.outcomes.values()) == outcomes
 
 
 @dataclass(frozen=True)
 class Deadly:
-    """A path that ends or holds up the process that opens it."""
+    """A path that ends or holds up the worker that opens it."""
 
     hangs: bool
+    home: int = field(default_factory=os.getpid)
 
     def __fspath__(self) -> str:
+        if os.getpid() == self.home:
+            return "none"
         if self.hangs:
             time.sleep(1000)
         os.kill(os.getpid(), signal.SIGKILL)
@@ -229,7 +335,53 @@ def test_a_worker_that_dies_or_hangs_fails_its_recording_alone(
     assert found["hanging"].startswith("it hung")
     assert "without any readable message" in found["broken"]
     assert found["good"] == found["better"] == ""
-    assert sorted(path.name for path in out.iterdir()) == ["better.csv", "good.csv", "settings.toml", "summary.csv"]
+    assert sorted(path.name for path in out.glob("[!.]*")) == ["better.csv", "good.csv", "settings.toml", "summary.csv"]
+
+
+def silent(seconds: float, tells: bool, on_frame: Any) -> str:
+    if tells:
+        on_frame()
+    time.sleep(seconds)
+    return "done"
+
+
+def answer(worker: workers.Worker) -> Any:
+    wait_until(lambda: worker.is_done)
+    try:
+        return worker.result()
+    except workers.WorkerLostError as error:
+        return str(error)
+    finally:
+        worker.kill()
+
+
+def test_a_large_recording_may_be_read_before_its_first_frame(
+    tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: dict[str, float] = {}
+    begin = workers.Worker.begin
+
+    def listen(worker: workers.Worker, function: Any, task: Task, parts: Path, **options: float) -> None:
+        told[task.name] = options["before_first"]
+        begin(worker, function, task, parts, **options)
+
+    with (tmp_path / "large.mcap").open("wb") as file:
+        file.truncate(20 * 10**9)
+    monkeypatch.setattr(workers.Worker, "begin", listen)
+    with ResultFolder(tmp_path / "out", {}, overwrite=False) as folder:
+        run_batch(folder, [task("large", tmp_path / "large.mcap"), task("small", tree / "day1" / "a")])
+    assert told["large"] > 600
+    assert told["small"] < 1
+    monkeypatch.setattr(workers.Worker, "begin", begin)
+
+    monkeypatch.setattr(workers, "LONGEST_SILENCE", 0.2)
+    patient, late, hasty = (workers.Worker() for _ in range(3))
+    patient.begin(silent, 1.0, False, before_first=600)
+    late.begin(silent, 600.0, True, before_first=600)
+    hasty.begin(silent, 600.0, False)
+    assert answer(patient) == "done"
+    assert answer(late).startswith("it hung")
+    assert answer(hasty).startswith("it hung")
 
 
 def test_a_result_that_cannot_be_written_is_one_recordings_failure(tree: Path, tmp_path: Path) -> None:
@@ -259,7 +411,7 @@ def test_what_is_listed_is_never_done_again(tmp_path: Path) -> None:
     with ResultFolder(out, {}, overwrite=False) as folder:
         assert folder.finished("day/a")
         assert not folder.finished("day/b")
-    assert sorted(path.name for path in out.rglob("*")) == ["a.csv", "day", "settings.toml", "summary.csv"]
+    assert sorted(path.name for path in out.rglob("[!.]*")) == ["a.csv", "day", "settings.toml", "summary.csv"]
     assert (out / "day" / "a.csv").read_text() == "whole"
 
 
@@ -273,7 +425,7 @@ def results_are_there(out: Path, count: int) -> bool:
 
 def test_killed_half_way_and_resumed_nothing_is_done_twice(run: Run, tree: Path) -> None:
     many = tree.parent / "many"
-    for index in range(12):
+    for index in range(40):
         shutil.copytree(tree / "day1" / "a", many / f"{index}")
     for index, content in enumerate((b"nothing", b"", (tree / "day2" / "a.mcap").read_bytes()[:900])):
         (many / f"broken{index}.mcap").write_bytes(content)
@@ -289,19 +441,19 @@ def test_killed_half_way_and_resumed_nothing_is_done_twice(run: Run, tree: Path)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     before = {name: stamp for name, stamp in results(out).items() if not name.startswith(".")}
-    assert 5 < len(before) < 13
+    assert 5 < len(before) < 41
     # A row more may be there, whose result is moved by the next run.
     assert before.keys() - {"summary.csv"} <= {row["result"] for row in rows(out).values()}
     code, told, _ = run("batch", "many", "--out", "out", *ROPE, "--jobs", 1)
     assert code == 3
-    assert "recordings 15 (12 finished, " in told
+    assert "recordings 43 (40 finished, " in told
     after = results(out)
     assert {name for name in before if after[name] != before[name]} == {"summary.csv"}
     assert run("batch", "many", "--out", "whole", *ROPE, "--jobs", 1)[0] == 3
     assert results(tree.parent / "whole").keys() == after.keys()
     for name in after.keys() - {"summary.csv"}:
         assert (out / name).read_bytes() == (tree.parent / "whole" / name).read_bytes()
-    assert not list(out.glob(".*"))
+    assert [path.name for path in out.glob(".*")] == [".lock"]
 
 
 @pytest.fixture
@@ -348,7 +500,7 @@ def test_a_full_disk_ends_the_batch_and_the_same_command_goes_on(run: Run, tree:
     assert code == 0
     assert f"recordings 12 (12 finished, {len(kept)} of them before, 0 failed" in told
     assert written == {path: path.stat().st_mtime_ns for path in kept}
-    assert not list(out.glob(".*"))
+    assert [path.name for path in out.glob(".*")] == [".lock"]
 
 
 def test_ctrl_c_keeps_what_is_finished(tree: Path) -> None:

@@ -27,12 +27,14 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
 
 from recordings_samples import contents
 from ropetrace.errors import FrameError, OutputError, RecordingError
 from ropetrace.live import CameraGoneError, LiveRecording
 from ropetrace.recorder import BackgroundRecorder, Recorder
 from ropetrace.recordings import open_recording
+from ropetrace.recordings.mcap_parts import read_summary
 from ropetrace.recordings.mcap_recover import recover
 from ropetrace.results import open_writer
 from ropetrace.results.base import WholeFile
@@ -250,6 +252,63 @@ def test_what_cannot_be_finished_is_left_alone(tmp_path: Path) -> None:
         recover(tmp_path / "none.mcap")
 
 
+@pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.NONE, CompressionType.ZSTD])
+def test_files_that_others_wrote_are_never_changed(run: Run, tmp_path: Path, compression: CompressionType) -> None:
+    path = tmp_path / "in" / "a.mcap"
+    path.parent.mkdir()
+    with path.open("wb") as stream:
+        writer: Any = Writer(stream, chunk_size=1000, compression=compression)
+        writer.start()
+        channel = writer.register_channel("/a", "json", writer.register_schema("a", "jsonschema", b"{}"))
+        for index in range(100):
+            writer.add_message(channel, index, b"%d" % index * 100, index)
+        writer.finish()
+    data = path.read_bytes()
+    assert recover(path).was_whole
+    damaged = bytearray(data)
+    damaged[3000] ^= 1
+    for left in (data[:-2000], bytes(damaged[:-500]), data[:30]):
+        path.write_bytes(left)
+        code, _, err = run("recover", "in/a.mcap")
+        assert (code, err.count("\n")) == (2, 1)
+        assert "in/a.mcap: not written by ropetrace: nothing was changed" in err
+        assert "`ropetrace record in/a.mcap --out copy.mcap`" in err
+        assert path.read_bytes() == left
+
+
+def test_a_message_index_that_is_damaged_is_not_copied(tmp_path: Path) -> None:
+    path, sizes = tmp_path / "a.mcap", []
+    with Recorder(path) as recorder:
+        for index in range(3):
+            recorder.write(noise_frame(index))
+            sizes.append(recorder.size)
+    whole = path.read_bytes()
+    data = bytearray(whole[: sizes[-1]])
+    data[-1] ^= 1  # the place of a message in its chunk
+    path.write_bytes(data)
+    recover(path)
+    assert path.read_bytes() == whole
+    data[sizes[1] - 1] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match="and whole frames follow"):
+        recover(path)
+    assert path.read_bytes() == data
+
+
+def test_the_index_may_be_larger_than_any_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for index in range(40):
+            recorder.write(noise_frame(index))
+        start = recorder.size
+    assert (tmp_path / "a.mcap").stat().st_size - start < 130 * 40 + 10_000, "what a day of 30 Hz is told to cost"
+    for module in ("mcap_parts", "mcap_source"):
+        monkeypatch.setattr(f"ropetrace.recordings.{module}.MAX_MESSAGE_BYTES", 4000, raising=False)
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        problems: list[str] = []
+        assert read_summary(stream, (tmp_path / "a.mcap").stat().st_size, problems) is not None
+    assert problems == []
+
+
 def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with file_limit(100_000), BackgroundRecorder(Recorder(path)) as background:
@@ -323,12 +382,12 @@ def test_what_comes_after_the_end_is_counted_and_nobody_waits(tmp_path: Path) ->
 def test_the_disk_is_made_to_take_it_twice_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
     monkeypatch.setattr(WholeFile, "sync", lambda file: calls.append(threading.current_thread().name))
+    started = time.monotonic()
     with Recorder(tmp_path / "a.mcap") as recorder:
         recorder.write(noise_frame(0))
-        started = time.monotonic()
-        wait_until(lambda: len(calls) == 3)
+        wait_until(lambda: len(calls) >= 3)
         assert time.monotonic() - started > 0.9
-        assert calls == ["recorder sync"] * 3
+        assert set(calls) == {"recorder sync"}
 
 
 def test_what_does_not_fit_the_queue_is_dropped_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -382,6 +441,51 @@ def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:
     assert len(read(path)) == 1
 
 
+@pytest.mark.parametrize("ending", [".csv", ".mcap", ".rrd"])
+def test_a_second_writer_destroys_nothing(tmp_path: Path, ending: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if ending == ".rrd":
+        pytest.importorskip("rerun")
+    path = tmp_path / f"a{ending}"
+    with open_writer(path) as writer:
+        writer.write(0, Estimate.lost(1, "nothing"))
+        before = path.read_bytes()
+        with pytest.raises(OutputError, match="being written by another"):
+            open_writer(path, overwrite=True)
+        assert path.read_bytes() == before
+    before, flock = path.read_bytes(), fcntl.flock
+    found = []
+
+    def lock(file: Any, operation: int) -> None:
+        flock(file, operation)
+        found.append((path.read_bytes(), fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE))
+
+    monkeypatch.setattr(fcntl, "flock", lock)
+    open_writer(path, overwrite=True).close()
+    assert found == [(before, os.O_WRONLY)], "locked before it is emptied, in a way that NFS takes"
+
+
+def test_without_a_frame_the_old_recording_stays(tmp_path: Path) -> None:
+    path, lost = tmp_path / "a.mcap", Estimate.lost(1, "nothing")
+    with Recorder(path) as recorder:
+        recorder.write_estimate(lost)
+        with pytest.raises(FrameError, match="ROS time"):
+            recorder.write(RgbdFrame(-1, noise_frame(1).depth, 0.001, CAMERA))
+    assert not path.exists()
+    path.write_bytes(b"old")
+    with Recorder(path, overwrite=True) as recorder:
+        for _ in range(1000):
+            recorder.write_estimate(lost)
+        with pytest.raises(FrameError, match="1000 estimates wait"):
+            recorder.write_estimate(lost)
+        assert path.read_bytes() == b"old"
+    assert path.read_bytes() == b"old"
+    with Recorder(path, overwrite=True) as recorder:
+        recorder.write_estimate(lost)
+        recorder.write(noise_frame(0))
+    assert len(messages(path)) == 3
+    assert_whole(path)
+
+
 # The commands
 
 
@@ -426,6 +530,72 @@ def test_record_refuses_in_one_line(run: Run, tmp_path: Path) -> None:
         assert words in err
     assert [path.name for path in tmp_path.iterdir()] == ["in.mcap"]
     assert len(read(source)) == 2
+
+
+def test_record_overwrites_when_a_frame_has_come(run: Run, tmp_path: Path) -> None:
+    write_mcap(tmp_path / "in.mcap", rope_frames(2))
+    old = write_mcap(tmp_path / "out.mcap", rope_frames(3)).read_bytes()
+    code, _, err = run("record", "in.mcap", "--out", "out.mcap", "--overwrite", "--start", 9)
+    assert (code, err) == (1, "ropetrace: no frame was recorded\n")
+    assert (tmp_path / "out.mcap").read_bytes() == old
+    assert run("record", "in.mcap", "--out", "out.mcap", "--overwrite")[0] == 0
+    assert len(read(tmp_path / "out.mcap")) == 2
+
+
+def test_an_interrupt_before_the_first_frame_is_told(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_mcap(tmp_path / "in.mcap", rope_frames(2))
+
+    def interrupted(*arguments: Any) -> Iterator[Frame]:
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr("ropetrace.recordings.ros_recording.RosRecording.frames", interrupted)
+    code, out, err = run("record", "in.mcap", "--out", "out.mcap")
+    assert (code, err) == (130, "ropetrace: interrupted; no frame was recorded\n")
+    assert "written" not in out
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_estimates_of_a_file_wait_for_the_disk(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = write_mcap(tmp_path / "in.mcap", rope_frames())
+    write = Recorder.write_estimate
+
+    def slow(recorder: Recorder, estimate: Estimate) -> None:
+        time.sleep(0.05)
+        write(recorder, estimate)
+
+    monkeypatch.setattr(Recorder, "write_estimate", slow)
+    monkeypatch.setattr("ropetrace.recorder.QUEUE_ESTIMATES", 1)
+    monkeypatch.setattr("ropetrace.trackers.make_tracker", lambda config: Slow(0.0))
+    code, out, _ = run("record", source, "--out", "out.mcap", "--diameter", "12mm")
+    assert code == 0
+    assert "lost      " not in out
+    assert sum(topic.endswith("status") for topic, _, _ in messages(tmp_path / "out.mcap")) == 8
+
+
+def test_estimates_that_are_lost_are_told(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = Recorder.write_estimate
+
+    def slow(recorder: Recorder, estimate: Estimate) -> None:
+        time.sleep(0.2)
+        write(recorder, estimate)
+
+    monkeypatch.setattr(Recorder, "write_estimate", slow)
+    monkeypatch.setattr("ropetrace.recorder.QUEUE_ESTIMATES", 1)
+    monkeypatch.setattr("ropetrace.trackers.make_tracker", lambda config: Slow(0.0))
+    set_camera(monkeypatch, noise_frame, period=0.005)
+    code, out, err = run("record", "sim:", "--out", "out.mcap", "--diameter", "12mm", "--limit", 20)
+    assert "recorded  20 frames" in out
+    assert number("estimates that the disk was too slow", out) > 0
+    assert (code, err) == (3, "ropetrace: part of the estimates is not in the recording (see above)\n")
+
+
+def test_stamps_that_do_not_fit_are_one_reason(tmp_path: Path) -> None:
+    with BackgroundRecorder(Recorder(tmp_path / "a.mcap")) as background:
+        for index in range(1, 6):
+            background.put(dataclasses.replace(noise_frame(index), stamp_ns=-index))
+            background.put_estimate(Estimate.lost(-index, "nothing"))
+    assert background.refused == {"the stamp does not fit a ROS time: before 1970, or after 2038": 10}
 
 
 def test_record_tells_what_is_missing(run: Run, tmp_path: Path) -> None:
@@ -491,10 +661,13 @@ def test_ctrl_c_leaves_a_whole_file(tmp_path: Path, number: signal.Signals) -> N
 
 
 class Slow:
-    """A tracker that takes three frames' time of a camera of 30 Hz, and finds nothing."""
+    """A tracker that finds nothing; by default in three frames' time of a camera of 30 Hz."""
+
+    def __init__(self, seconds: float = 0.1) -> None:
+        self._seconds = seconds
 
     def update(self, frame: Frame | BadFrame, lap: Any = None) -> Estimate:
-        time.sleep(0.1)
+        time.sleep(self._seconds)
         return Estimate.lost(frame.stamp_ns, "not looked for")
 
     def cloud(self) -> None:
@@ -634,8 +807,8 @@ def killed_on_a_terminal(source: str, path: Path, rope: tuple[str, ...], seconds
         return max(map(int, re.findall(rb"(\d+)frame \[", shown)), default=0)
 
     with process:
-        end = math.inf
-        while process.poll() is None and time.monotonic() < end:
+        end, deadline = math.inf, time.monotonic() + 60
+        while process.poll() is None and time.monotonic() < min(end, deadline):
             if select.select([ours], [], [], 0.1)[0]:
                 shown += os.read(ours, 65536)
             if end == math.inf and told():

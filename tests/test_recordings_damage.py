@@ -33,6 +33,7 @@ from recordings_samples import (
 )
 from ropetrace.errors import RecordingError, RopetraceError
 from ropetrace.recordings import images, open_recording
+from ropetrace.recordings.base import note
 from ropetrace.recordings.decompress import DamageError, decompress
 from ropetrace.recordings.rgbd_folder import RgbdFolderWriter
 from test_recordings_clouds import COLORS, POINTS, npy, npz, pcd, ply
@@ -387,3 +388,15 @@ def test_write_camera_is_sound(tmp_path: Path) -> None:
     write_camera(tmp_path / "intrinsics.json")
     (tmp_path / "depth_0.png").write_bytes(images.encode_png(FRAMES[0].depth))
     assert len(list(open_recording(tmp_path, rate=1).frames())) == 1
+
+
+def test_of_very_much_damage_the_middle_is_left_out() -> None:
+    problems: list[str] = []
+    for _ in range(2):  # as in a second pass
+        for index in range(20_000):
+            note(problems, f"frame {index} is lost")
+        note(problems, "20000 frames are lost")
+    assert problems[:2] == ["frame 0 is lost", "frame 1 is lost"]
+    assert problems[-1] == "20000 frames are lost"
+    assert "is not listed" in " ".join(problems)
+    assert len(problems) == 100

@@ -393,7 +393,7 @@ def test_no_flipped_bit_of_an_mcap_changes_data(tmp_path: Path) -> None:
 @pytest.mark.parametrize("stamp_ns", [-1, 2**31 * 10**9])
 def test_mcap_refuses_a_stamp_that_ros_cannot_hold(tmp_path: Path, stamp_ns: int) -> None:
     with open_writer(tmp_path / "run.mcap") as writer:
-        with pytest.raises(OutputError, match=f"frame 7: the stamp {stamp_ns} ns does not fit"):
+        with pytest.raises(OutputError, match="frame 7: the stamp does not fit a ROS time"):
             writer.write(7, Estimate.lost(stamp_ns, "nothing"))
         writer.write(8, Estimate.lost(0, "nothing"))
     assert len(frames_in(tmp_path / "run.mcap")) == 1
@@ -402,7 +402,7 @@ def test_mcap_refuses_a_stamp_that_ros_cannot_hold(tmp_path: Path, stamp_ns: int
 def test_mcap_refuses_a_prediction_that_ros_cannot_hold(tmp_path: Path) -> None:
     late = dataclasses.replace(estimate(1), stamp_ns=2**31 * 10**9 - 1, ahead_ns=1)
     with open_writer(tmp_path / "run.mcap") as writer:
-        with pytest.raises(OutputError, match=f"frame 7: the predicted time {2**31 * 10**9} ns does not fit"):
+        with pytest.raises(OutputError, match="frame 7: the predicted time does not fit a ROS time"):
             writer.write(7, late)
         writer.write(8, dataclasses.replace(late, ahead_ns=0))
     assert len(frames_in(tmp_path / "run.mcap")) == 1

@@ -32,7 +32,7 @@ from typing import Any, Self
 
 from ropetrace.config import RopeConfig
 from ropetrace.errors import ConfigError, OutputError, RecordingError, RopetraceError
-from ropetrace.evaluation.run_folder import SettingsFile, replace_file
+from ropetrace.evaluation.run_folder import LOCK_FILE, SettingsFile, replace_file
 from ropetrace.evaluation.runner import dask_executor
 from ropetrace.evaluation.workers import Worker, WorkerLostError, Workers
 from ropetrace.motion import make_motion
@@ -44,10 +44,16 @@ from ropetrace.trackers import make_tracker
 from ropetrace.tracking import track_recording
 from ropetrace.types import Estimate, Status
 
-FORMATS = ("csv", "parquet", "npz", "mcap")
-"""The endings of results."""
-
 SUMMARY = "summary.csv"
+
+_MOST_DAMAGE = 5
+"""Sentences on the damage of a recording that the summary has."""
+
+_MOST_TEXT = 5000
+"""Letters of one cell of the summary; tools, Python's `csv` among them, refuse very long ones."""
+
+_SLOWEST_READING = 20e6
+"""Bytes a second: a recording that was never closed has to be read as a whole before its first frame."""
 
 _PARTS = ".part-"
 """What the folder of a run begins with in which workers write."""
@@ -103,7 +109,7 @@ class Task:
     name : str
         Its path below the folder that all recordings are in.
     format : str
-        One of `FORMATS`.
+        The ending of results.
     config : RopeConfig
         Of the rope.
     options : mapping
@@ -168,8 +174,8 @@ class ResultFolder:
             file.measured(settings)
         with ExitStack() as stack, writing(path):
             path.mkdir(parents=True, exist_ok=True)
-            # Of the folder itself: the settings are replaced as a whole.
-            handle = os.open(path, os.O_RDONLY)
+            # A file of its own, since all others are replaced as a whole; open for writing, as NFS demands for a lock.
+            handle = os.open(path / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
             stack.callback(os.close, handle)
             lock(handle, path)
             before = self._read()
@@ -226,6 +232,8 @@ class ResultFolder:
         OutputError
             If the summary cannot be written.
         """
+        if len(outcome.error) > _MOST_TEXT:
+            outcome = replace(outcome, error=f"{outcome.error[:_MOST_TEXT]}...")
         if not outcome.failed:
             place = self.path / outcome.result
             try:
@@ -254,12 +262,13 @@ class ResultFolder:
         return bool(outcome.result) and (self.path / outcome.result).is_file()
 
     def _read(self) -> list[Outcome]:
-        """The outcomes of the summary; a row that was cut off by a kill is none."""
+        """The outcomes of the summary; a row that was cut off by a kill, or is none that we write, is none."""
         if not self._summary.exists():
             return []
         found = []
-        text = self._summary.read_text(encoding="utf-8", errors="surrogateescape")
-        for row in list(csv.reader(io.StringIO(text, newline="")))[1:]:
+        # Bytes, since a text file has other ends of lines than a name may have.
+        text = self._summary.read_bytes().decode("utf-8", "surrogateescape")
+        for row in _whole_rows(text)[1:]:
             try:
                 recording, frames, ok, degraded, lost, seconds, result, error = row
                 counts = (int(frames), int(ok), int(degraded), int(lost))
@@ -277,8 +286,21 @@ class ResultFolder:
 
 def _rows(rows: Sequence[tuple[Any, ...]]) -> bytes:
     stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerows(rows)
+    # All texts are quoted: names may have any end of a line in them.
+    csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC).writerows(rows)
     return stream.getvalue().encode("utf-8", "surrogateescape")
+
+
+def _whole_rows(text: str) -> list[list[str]]:
+    """The rows of a CSV text that can be read."""
+    rows, reader = [], csv.reader(io.StringIO(text, newline=""))
+    while True:
+        try:
+            rows.append(next(reader))
+        except csv.Error:
+            continue
+        except StopIteration:
+            return rows
 
 
 def run_batch(
@@ -332,7 +354,7 @@ def _run_here(tasks: Sequence[Task], parts: Path, jobs: int) -> Generator[Outcom
         while waiting or running:
             while waiting and (worker := workers.idle()):
                 task = running[worker] = waiting.popleft()
-                worker.begin(track_task, task, parts)
+                worker.begin(track_task, task, parts, before_first=_size(task.recording) / _SLOWEST_READING)
             for worker in workers.wait(running):
                 task = running.pop(worker)
                 try:
@@ -341,6 +363,16 @@ def _run_here(tasks: Sequence[Task], parts: Path, jobs: int) -> Generator[Outcom
                     raise
                 except (RopetraceError, WorkerLostError) as error:
                     yield Outcome(task.name, error=str(error))
+
+
+def _size(recording: Path) -> int:
+    """Bytes of a file, or of those in a folder; 0 for what is not known."""
+    try:
+        if os.path.isdir(recording):
+            return sum(entry.stat().st_size for entry in os.scandir(recording))
+        return os.path.getsize(recording)
+    except OSError:
+        return 0
 
 
 def _run_there(tasks: Sequence[Task], parts: Path, cluster: str) -> Generator[Outcome]:
@@ -437,7 +469,8 @@ def _tracked(task: Task, part: Path, on_frame: Callable[[], object], started: fl
     if not summary.frames:
         raise RecordingError(f"{task.recording}: there is no frame at or after --start {task.start}")
     ok, degraded, lost = (sum(rope.statuses[status] for rope in summary.ropes.values()) for status in Status)
-    damage = "; ".join(recording.problems)
+    more = len(recording.problems) - _MOST_DAMAGE
+    damage = "; ".join([*recording.problems[:_MOST_DAMAGE], *([f"and {more} more"] if more > 0 else [])])
     seconds = _seconds_since(started)
     return Outcome(task.name, summary.frames, ok, degraded, lost, seconds, task.result, damage)
 

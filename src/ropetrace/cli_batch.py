@@ -58,6 +58,8 @@ class Batch:
             import_extra("pyarrow", "parquet")
         config = self.rope.settings()
         found = find_recordings(self.recordings, self.out)
+        for trouble in found.unreadable:
+            print(trouble, file=sys.stderr)
         self._check_out(found)
         tasks = self._tasks(found, config)
         with ResultFolder(self.out, self._settings(found, config), self.overwrite) as folder:
@@ -89,23 +91,17 @@ class Batch:
 
     def _check_out(self, found: Found) -> None:
         """Results in a recording would be taken for a part of it."""
-        out = self.out.resolve()
+        out = Path(os.path.realpath(self.out))
         for recording in found.recordings.values():
-            if recording.resolve() in (out, *out.parents):
+            if Path(os.path.realpath(recording)) in (out, *out.parents):
                 raise OutputError(f"{self.out} is, or lies in, the recording {recording}: choose another folder")
 
     def _tasks(self, found: Found, config: RopeConfig) -> list[Any]:
         from ropetrace.batch import SUMMARY, Task
 
         part = self.part
-        options = {
-            "rate": part.rate,
-            "depth_topic": part.depth_topic,
-            "color_topic": part.color_topic,
-            "cloud_topic": part.cloud_topic,
-        }
         tasks = [
-            Task(path, name, self.format, config, options, part.start, part.limit)
+            Task(path, name, self.format, config, part.options(), part.start, part.limit)
             for name, path in found.recordings.items()
         ]
         if any(task.result == SUMMARY for task in tasks):
@@ -125,6 +121,8 @@ class Batch:
 
 def _tell(folder: ResultFolder, outcomes: list[Outcome], before: int) -> int:
     """Say what came of it; the exit code."""
+    from ropetrace.batch import SUMMARY
+
     failed = [outcome for outcome in outcomes if outcome.failed]
     damaged = [outcome for outcome in outcomes if outcome.error and not outcome.failed]
     frames, ok, degraded, lost = (
@@ -133,7 +131,7 @@ def _tell(folder: ResultFolder, outcomes: list[Outcome], before: int) -> int:
     print(f"recordings {len(outcomes)} ({len(outcomes) - len(failed)} finished, {before} of them before, ", end="")
     print(f"{len(failed)} failed, {len(damaged)} damaged)")
     print(f"frames     {frames} ({ok} ok, {degraded} degraded, {lost} lost)")
-    print(f"summary    {folder.path / 'summary.csv'}")
+    print(f"summary    {folder.path / SUMMARY}")
     if not ok + degraded:
         print("ropetrace: no frame gave an estimate; `ropetrace doctor` on one recording says why", file=sys.stderr)
         return NOTHING_FOUND

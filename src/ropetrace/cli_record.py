@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ropetrace.recordings import Recording
     from ropetrace.trackers import Tracker
     from ropetrace.tracking import Summary
-    from ropetrace.types import Event, Frame
+    from ropetrace.types import Cloud, Estimate, Event, Frame
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,9 @@ class Record:
         tracker = None if config is None else make_tracker(config)
         metadata = {} if config is None else {"config": config.resolved().to_toml()}
         recorder = Recorder(self.out, overwrite=self.overwrite, metadata=metadata)
-        try:
-            with BackgroundRecorder(recorder) as background:
-                run = _Run(self.source, recording, background)
-                summary = run.frames() if config is None or tracker is None else run.tracked(config, tracker)
-        finally:
-            if not recorder.frames:
-                self.out.unlink(missing_ok=True)
+        with BackgroundRecorder(recorder) as background:
+            run = _Run(self.source, recording, background)
+            summary = run.frames() if config is None or tracker is None else run.tracked(config, tracker)
         return run.tell(summary, config is not None)
 
     def _config(self) -> RopeConfig | None:
@@ -137,13 +133,20 @@ class _Run:
             return track_recording(
                 events,
                 tracker,
-                [self._recorder],
+                [self],
                 motion=partial(make_motion, config.motion.method, config.diameter),
                 first_index=self._part.start,
                 age=None if self._live is None else self._live.age,
                 on_frame=lambda estimate: self._show(bar),
                 should_stop=self._should_stop,
             )
+
+    def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
+        """Hand over an estimate; of a file it waits for the disk, as the frames do. A `ropetrace.tracking.Sink`."""
+        if self._live is None:
+            self._recorder.put_estimate(estimate)
+        else:
+            self._recorder.write(index, estimate)
 
     def tell(self, summary: Summary, tracked: bool) -> int:
         """Say what came of it; the exit code."""
@@ -176,14 +179,18 @@ class _Run:
         if written.frames:
             print(f"written   {written.path}")
         # A live source has no other end.
-        if summary.interrupted and self._live is None:
+        interrupted = summary.interrupted and self._live is None
+        if not written.frames:
+            print(f"ropetrace: {'interrupted; ' * interrupted}no frame was recorded", file=sys.stderr)
+            return INTERRUPTED if interrupted else NOTHING_FOUND
+        if interrupted:
             print("ropetrace: interrupted; what was recorded until then is kept", file=sys.stderr)
             return INTERRUPTED
-        if not written.frames:
-            print("ropetrace: no frame was recorded", file=sys.stderr)
-            return NOTHING_FOUND
         if recording.problems or recorder.dropped or recorder.refused or self._unreadable:
             print("ropetrace: part of the frames is not in the recording (see above)", file=sys.stderr)
+            return DAMAGED
+        if recorder.dropped_estimates:
+            print("ropetrace: part of the estimates is not in the recording (see above)", file=sys.stderr)
             return DAMAGED
         return 0
 

@@ -62,13 +62,11 @@ class Part:
                 raise ConfigError(f"{recording}: a live source is never twice the same: give a recording")
             if self.start:
                 raise ConfigError(f"--start {self.start}: a live source begins when it is opened: leave out --start")
-        return open_recording(
-            recording,
-            rate=self.rate,
-            depth_topic=self.depth_topic,
-            color_topic=self.color_topic,
-            cloud_topic=self.cloud_topic,
-        )
+        return open_recording(recording, **self.options())
+
+    def options(self) -> dict[str, Any]:
+        """What `open_recording` is told of any recording."""
+        return {name: getattr(self, name) for name in ("rate", "depth_topic", "color_topic", "cloud_topic")}
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,8 @@ class Recorder(Closing):
 
     When `write` returns, the system has the frame: whoever kills the process cannot take it. A thread has the disk take
     it within a second. Images go to the topics of `ropetrace.recordings.ros_frames`, estimates to those of
-    `ropetrace.results.ros`. The first frame says what all are: a recording has one camera.
+    `ropetrace.results.ros`. The first frame says what all are: a recording has one camera. Until it is written a file
+    that is overwritten stays as it was, and estimates wait for it; without any frame no file comes of it.
 
     Parameters
     ----------
@@ -63,6 +64,7 @@ class Recorder(Closing):
         self.frames = 0
         self._nature: tuple[Any, ...] | None = None
         self._estimates = EstimateMessages("camera")
+        self._early: list[list[RawMessage]] = []
         records = {METADATA: {**(metadata or {}), "frame_name": "camera"}}
         self._file = McapAppender(self.path, overwrite, records)
         self._closing = threading.Event()
@@ -91,6 +93,8 @@ class Recorder(Closing):
         self._append(frame_messages(frame))
         self._nature = nature
         self.frames += 1
+        while self._early:
+            self._append(self._early.pop(0))
 
     def write_estimate(self, estimate: Estimate) -> None:
         """Add the estimate of one rope in one frame, in the camera's frame.
@@ -98,14 +102,22 @@ class Recorder(Closing):
         Raises
         ------
         FrameError
-            If a time does not fit a ROS time.
+            If a time does not fit a ROS time, or a thousand estimates wait for the first frame already.
         OutputError
             If the disk refuses.
         """
-        self._append(self._estimates.of(estimate))
+        messages = self._estimates.of(estimate)
+        if self.frames:
+            self._append(messages)
+        elif len(self._early) < QUEUE_ESTIMATES:
+            self._early.append(messages)
+        else:
+            raise FrameError(f"{QUEUE_ESTIMATES} estimates wait for the first frame already")
 
     def close(self) -> None:
         """Write the index that other tools want, and close the file; a second call does nothing.
+
+        Without a frame a new file is removed, and one that was there is left as it was.
 
         Raises
         ------
@@ -114,7 +126,10 @@ class Recorder(Closing):
         """
         self._closing.set()
         self._syncing.join()
-        self._file.close()
+        if self.frames:
+            self._file.close()
+        else:
+            self._file.discard()
         # The system tells of a fault of the disk once: asked again by `close`, it knows of none.
         error, self._sync_error = self._sync_error, None
         if error is not None:
@@ -188,12 +203,13 @@ class BackgroundRecorder(Closing):
     def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
         """Hand over an estimate without waiting; a `ropetrace.tracking.Sink`."""
         with self._changed:
-            if self._has_ended or self._estimates >= QUEUE_ESTIMATES:
-                self.dropped_estimates += 1
-                return
-            self._estimates += 1
-            self._items.append(estimate)
-            self._changed.notify_all()
+            self._add_estimate(estimate)
+
+    def put_estimate(self, estimate: Estimate) -> None:
+        """Hand over an estimate, and wait until there is room, as `put` does."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._has_ended or self._estimates < QUEUE_ESTIMATES)
+            self._add_estimate(estimate)
 
     def close(self) -> None:
         """Wait until all that was handed over is written, and close the recorder; a second call does nothing.
@@ -226,6 +242,14 @@ class BackgroundRecorder(Closing):
         self._items.append(frame)
         self._changed.notify_all()
         return True
+
+    def _add_estimate(self, estimate: Estimate) -> None:
+        if self._has_ended or self._estimates >= QUEUE_ESTIMATES:
+            self.dropped_estimates += 1
+            return
+        self._estimates += 1
+        self._items.append(estimate)
+        self._changed.notify_all()
 
     def _work(self) -> None:
         while True:

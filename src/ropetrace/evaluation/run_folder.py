@@ -17,7 +17,11 @@ import numpy as np
 
 from ropetrace.config import read_toml
 from ropetrace.errors import ConfigError, OutputError
+from ropetrace.recordings.base import printable
 from ropetrace.results.base import uninterrupted, writing
+
+LOCK_FILE = ".lock"
+"""What a process locks in a folder to which it alone writes; it stays there, and is of no other meaning."""
 
 
 class Named(Protocol):
@@ -68,7 +72,7 @@ class SettingsFile:
             if folder.exists() and not folder.is_dir():
                 raise OutputError(f"{folder} is a file: give the name of a folder")
             if not self._path.exists():
-                if folder.exists() and any(folder.iterdir()):
+                if folder.exists() and any(path.name != LOCK_FILE for path in folder.iterdir()):
                     raise OutputError(
                         f"{folder} holds other things, and no settings.toml: choose another --out, "
                         "or give --overwrite to write among them"
@@ -254,11 +258,11 @@ def _flat(table: dict[str, Any], start: str = "") -> dict[str, Any]:
 
 
 def _shown(value: Any) -> str:
-    """As TOML."""
+    """As TOML, which takes no bytes that are no text, as names of files may have."""
     if value is None:
         return "not set"
     if isinstance(value, (tuple, list)):
         return "[" + ", ".join(map(_shown, value)) + "]"
     if isinstance(value, bool):
         return "true" if value else "false"
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else repr(value)
+    return json.dumps(printable(value), ensure_ascii=False) if isinstance(value, str) else repr(value)

@@ -46,10 +46,15 @@ class Worker:
         theirs.close()
         self._answer: Any = None
         self._heard = 0.0
+        self._before_first = 0.0
 
-    def begin(self, function: Callable[..., Any], *arguments: Any) -> None:
-        """Have a function called with these arguments and `on_frame`, which it is to call as a sign of life."""
+    def begin(self, function: Callable[..., Any], *arguments: Any, before_first: float = 0.0) -> None:
+        """Have a function called with these arguments and `on_frame`, which it is to call as a sign of life.
+
+        Before the first such sign it may be silent for `before_first` seconds longer than later.
+        """
         self._answer, self._heard = None, time.monotonic()
+        self._before_first = before_first
         with suppress(OSError):  # `is_done` sees that it died
             self.pipe.send((function, arguments))
 
@@ -59,11 +64,13 @@ class Worker:
         try:
             while self._answer is None and self.pipe.poll():
                 self._answer, self._heard = self.pipe.recv(), time.monotonic()
+                self._before_first = 0.0
         except (OSError, EOFError):
             self._process.join(1)
             self._answer = WorkerLostError(f"its process was killed ({self._end()})")
-        if self._answer is None and time.monotonic() - self._heard > LONGEST_SILENCE:
-            self._answer = WorkerLostError(f"it hung: no frame was finished for {LONGEST_SILENCE:g} s")
+        patience = LONGEST_SILENCE + self._before_first
+        if self._answer is None and time.monotonic() - self._heard > patience:
+            self._answer = WorkerLostError(f"it hung: no frame was finished for {patience:.0f} s")
         return self._answer is not None
 
     def result(self) -> Any:

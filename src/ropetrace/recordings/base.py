@@ -192,10 +192,22 @@ class StampStatistics:
         return StreamInfo(name, encoding, self.count, width, height, rate, gap, self.not_rising)
 
 
+MOST_PROBLEMS = 100
+"""Sentences on the damage of one recording."""
+
+_LAST_PROBLEMS = 9
+"""Of those, the ones that came last: at the end a reader sums up the loss."""
+
+_MORE_PROBLEMS = "further damage of the same kinds is not listed"
+
+
 def note(problems: list[str], problem: str) -> None:
-    """Add a problem, unless an earlier pass over the recording found it already."""
-    if problem not in problems:
-        problems.append(problem)
+    """Add a problem, unless an earlier pass over the recording found it; of very many the middle is left out."""
+    if problem in problems:
+        return
+    problems.append(problem)
+    if len(problems) > MOST_PROBLEMS:
+        problems[-_LAST_PROBLEMS - 2 : -_LAST_PROBLEMS] = [_MORE_PROBLEMS]
 
 
 def one_line(error: Exception) -> str:

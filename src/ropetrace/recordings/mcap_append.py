@@ -32,28 +32,25 @@ from mcap.records import (
 )
 
 from ropetrace.errors import OutputError
-from ropetrace.recordings.mcap_parts import HEAD, MAGIC
+from ropetrace.recordings.mcap_parts import CHUNK, HEAD, MAGIC, MESSAGE
 from ropetrace.recordings.ros_messages import RawMessage
-from ropetrace.results.base import WholeFile, lock, uninterrupted, writing
+from ropetrace.results.base import WholeFile, uninterrupted
 from ropetrace.results.ros_estimates import typestore
 
 COMPRESSION = "zstd"
 _LEVEL = 1
 
-CHUNK = struct.Struct("<QQQII")
-"""The front of a chunk: times of its first and last message, bytes and checksum of its content, length of the name of
-its compression."""
-
-MESSAGE = struct.Struct("<HIQQ")
-"""The front of a message: channel, sequence, time of recording and of publication."""
+LIBRARY = "ropetrace "
+"""What the header of every file that is written here tells, before the version."""
 
 
 class McapAppender:
     """Appends messages to a new MCAP file, a compressed chunk with a checksum a call.
 
-    When `append` returns the system has the chunk, and a kill cannot take it. The file can be read from the front at
-    any time; `close` adds the index that other tools want, and `ropetrace.recordings.mcap_recover` adds it to a file
-    that was never closed. Another process that would write to the file meanwhile is refused by a lock.
+    What was in the file before is there until `begin`. When `append` returns the system has the chunk, and a kill
+    cannot take it. The file can be read from the front at any time; `close` adds the index that other tools want, and
+    `ropetrace.recordings.mcap_recover` adds it to a file that was never closed. Another process that would write to the
+    file meanwhile is refused by a lock.
 
     Parameters
     ----------
@@ -71,22 +68,28 @@ class McapAppender:
     """
 
     def __init__(self, path: Path, overwrite: bool, metadata: Mapping[str, Mapping[str, str]]) -> None:
-        if overwrite:
-            refuse_locked(path)
         self._index = McapIndex()
         self._compressor = zstandard.ZstdCompressor(level=_LEVEL)
         self._crc = 0
         self._broken = False
         self._closed = False
+        self._start = MAGIC + packed(Header("ros2", LIBRARY + version("ropetrace")))
+        for name, values in metadata.items():
+            record = packed(Metadata(name=name, metadata=dict(values)))
+            self._index.add_metadata(name, len(self._start), len(record))
+            self._start += record
         self._file = WholeFile(path, overwrite)
-        with self._file.closed_on_error():
-            self._file.lock()
-            start = MAGIC + packed(Header("ros2", f"ropetrace {version('ropetrace')}"))
-            for name, values in metadata.items():
-                record = packed(Metadata(name=name, metadata=dict(values)))
-                self._index.add_metadata(name, len(start), len(record))
-                start += record
-            self._add(start)
+
+    def begin(self) -> None:
+        """Write the start of the file, in the place of what was in it; the first `append` does it where nobody did.
+
+        Raises
+        ------
+        OutputError
+            If the file cannot be written.
+        """
+        if not self._file.size:
+            self._add(self._start)
 
     def append(self, messages: Sequence[RawMessage]) -> None:
         """Add messages as one chunk, wholly or not at all.
@@ -96,6 +99,7 @@ class McapAppender:
         OutputError
             If the file cannot be written. Nothing more can be appended then.
         """
+        self.begin()
         content = bytearray()
         entries: Entries = {}
         for message in messages:
@@ -152,10 +156,22 @@ class McapAppender:
         try:
             # A full disk that refused a frame may well have room for the index.
             with uninterrupted(), contextlib.suppress(OutputError) if self._broken else contextlib.nullcontext():
+                self.begin()
                 self._file.append(self._index.ending(self._file.size, self._crc))
                 self._file.sync()
         finally:
             self._file.close()
+
+    def discard(self) -> None:
+        """Close the file as if it had never been opened: a new one is removed, and one to which was appended too.
+
+        Raises
+        ------
+        OutputError
+            If it cannot be removed.
+        """
+        self._closed = True
+        self._file.discard()
 
     def _add(self, data: bytes) -> None:
         if self._broken:
@@ -262,22 +278,23 @@ class McapIndex:
             metadata_count=self.metadata,
             schema_count=len(self.schemas),
         )
-        groups = {
+        groups: dict[Opcode, bytes | bytearray] = {
             Opcode.SCHEMA: b"".join(map(packed, self.schemas.values())),
             Opcode.CHANNEL: b"".join(map(packed, self.channels.values())),
             Opcode.STATISTICS: packed(statistics),
-            Opcode.CHUNK_INDEX: bytes(self._chunk_records),
-            Opcode.METADATA_INDEX: bytes(self._metadata_records),
+            Opcode.CHUNK_INDEX: self._chunk_records,
+            Opcode.METADATA_INDEX: self._metadata_records,
         }
-        summary, offsets = b"".join(groups.values()), b""
-        place = start
+        offsets, place, crc = b"", start, 0
         for opcode, group in groups.items():
+            crc = zlib.crc32(group, crc)
             if group:
                 offsets += packed(SummaryOffset(opcode, place, len(group)))
             place += len(group)
         footer = packed(Footer(start, place, 0))
-        crc = zlib.crc32(footer[: -struct.calcsize("<I")], zlib.crc32(summary + offsets))
-        return end + summary + offsets + packed(Footer(start, place, crc)) + MAGIC
+        crc = zlib.crc32(footer[: -struct.calcsize("<I")], zlib.crc32(offsets, crc))
+        # Joined once: after a day the chunks' records are a third of a gigabyte.
+        return b"".join([end, *groups.values(), offsets, packed(Footer(start, place, crc)), MAGIC])
 
 
 def packed(record: McapRecord) -> bytes:
@@ -290,14 +307,6 @@ def packed(record: McapRecord) -> bytes:
 def message_indexes(entries: Entries) -> dict[int, bytes]:
     """The records that follow a chunk, by channel."""
     return {channel: packed(MessageIndex(channel, rows)) for channel, rows in entries.items()}
-
-
-def refuse_locked(path: Path) -> None:
-    """Raise an OutputError if another process writes to a file."""
-    with writing(path):
-        if path.is_file():
-            with path.open("rb") as file:
-                lock(file, path)
 
 
 @cache

@@ -15,11 +15,21 @@ from mcap.records import Channel, ChunkIndex, Footer, Schema, Statistics
 
 from ropetrace.recordings.base import note, one_line, printable
 from ropetrace.recordings.decompress import DamageError
-from ropetrace.recordings.ros_messages import MAX_MESSAGE_BYTES, ros2_type
+from ropetrace.recordings.ros_messages import ros2_type
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")
 """A record's type and length."""
+
+CHUNK = struct.Struct("<QQQII")
+"""The front of a chunk: times of its first and last message, bytes and checksum of its content, length of the name of
+its compression."""
+
+MESSAGE = struct.Struct("<HIQQ")
+"""The front of a message: channel, sequence, time of recording and of publication."""
+
+MAX_SUMMARY_BYTES = 4 * 2**30
+"""The largest summary that is read: that of two weeks of depth and colour at 30 Hz, a chunk each."""
 
 _FOOTER_BYTES = 29
 
@@ -67,7 +77,7 @@ def read_summary(stream: BinaryIO, size: int, problems: list[str]) -> Summary | 
         return None
     length = size - tail_bytes - footer.summary_start
     damaged = "the summary at the end of the file is damaged; the messages are read without it"
-    if footer.summary_start < len(MAGIC) or not 0 <= length <= MAX_MESSAGE_BYTES:
+    if footer.summary_start < len(MAGIC) or not 0 <= length <= MAX_SUMMARY_BYTES:
         note(problems, damaged)
         return None
     stream.seek(footer.summary_start)

@@ -11,20 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Channel, Header, Metadata, Schema
 
 from ropetrace.errors import RecordingError
 from ropetrace.recordings.decompress import DamageError, decompress
 from ropetrace.recordings.mcap_append import (
-    CHUNK,
     COMPRESSION,
-    MESSAGE,
+    LIBRARY,
     ChunkRecord,
     Entries,
     McapIndex,
     message_indexes,
 )
-from ropetrace.recordings.mcap_parts import HEAD, MAGIC, parsed, read_summary, split
+from ropetrace.recordings.mcap_parts import CHUNK, HEAD, MAGIC, MESSAGE, parsed, read_summary, split
 from ropetrace.recordings.ros_messages import MAX_MESSAGE_BYTES
 from ropetrace.results.base import lock, uninterrupted, writing
 
@@ -79,11 +78,16 @@ def recover(path: Path, on_bytes: Callable[[int], object] = lambda count: None) 
         if file.read(len(MAGIC)) != MAGIC:
             raise RecordingError(f"{path}: not an MCAP file")
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            if not _library(data).startswith(LIBRARY):
+                raise RecordingError(
+                    f"{path}: not written by ropetrace: nothing was changed; copy the frames that can be read with "
+                    f"`ropetrace record {path} --out copy.mcap`"
+                )
             whole = _whole_part(path, data, on_bytes)
             if _chunk_follows(data, whole.end):
                 raise RecordingError(
                     f"{path}: damaged at byte {whole.end}, and whole frames follow: nothing was changed; copy the "
-                    f"frames that can be read with `ropetrace record {path.name} --out copy.mcap`"
+                    f"frames that can be read with `ropetrace record {path} --out copy.mcap`"
                 )
             crc = _checksum(data, whole.end)
         if not whole.index.chunks:
@@ -114,6 +118,7 @@ def _whole_part(path: Path, data: mmap.mmap, on_bytes: Callable[[int], object]) 
     offset = whole.end
     pending: tuple[ChunkRecord, Entries] | None = None
     found: dict[int, bytes] = {}
+    expected: dict[int, bytes] = {}
     for opcode, start, length in _records(data, offset):
         payload = data[start + HEAD.size : start + length]
         if opcode != Opcode.MESSAGE_INDEX and pending is not None:
@@ -122,8 +127,12 @@ def _whole_part(path: Path, data: mmap.mmap, on_bytes: Callable[[int], object]) 
         try:
             if opcode == Opcode.CHUNK:
                 pending = _chunk(whole.index, start, payload)
+                expected = message_indexes(pending[1])
             elif opcode == Opcode.MESSAGE_INDEX:
-                found[struct.unpack_from("<H", payload)[0]] = data[start : start + length]
+                (channel,) = struct.unpack_from("<H", payload)
+                if data[start : start + length] != expected.get(channel):
+                    break  # no checksum tells that it is damaged
+                found[channel] = expected[channel]
             elif opcode == Opcode.METADATA:
                 whole.index.add_metadata(parsed(Metadata, payload).name, start, length)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -136,15 +145,25 @@ def _whole_part(path: Path, data: mmap.mmap, on_bytes: Callable[[int], object]) 
             break
         offset = start + length
         on_bytes(length)
-        if pending is None or set(found) == set(pending[1]):
+        if pending is None or found == expected:
             whole.end = offset
     if pending is not None:
         chunk, entries = pending
-        indexes = found if set(found) == set(entries) else message_indexes(entries)
-        if indexes is not found:
-            whole.end, whole.missing = chunk.offset + chunk.length, b"".join(indexes.values())
-        whole.index.add_chunk(chunk, entries, indexes)
+        if found != expected:
+            whole.end, whole.missing = chunk.offset + chunk.length, b"".join(expected.values())
+        whole.index.add_chunk(chunk, entries, expected)
     return whole
+
+
+def _library(data: mmap.mmap) -> str:
+    """What wrote a file, as its header tells; empty without one."""
+    opcode, start, length = next(_records(data, len(MAGIC)), (0, 0, 0))
+    if opcode != Opcode.HEADER:
+        return ""
+    try:
+        return str(parsed(Header, data[start + HEAD.size : start + length]).library)
+    except DamageError:
+        return ""
 
 
 def _records(data: mmap.mmap, offset: int) -> Iterator[tuple[int, int, int]]:

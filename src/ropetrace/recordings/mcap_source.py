@@ -18,11 +18,9 @@ from mcap.opcode import Opcode
 
 from ropetrace.recordings.base import note
 from ropetrace.recordings.decompress import DamageError, decompress
-from ropetrace.recordings.mcap_parts import HEAD, MAGIC, Channels, read_summary, split
+from ropetrace.recordings.mcap_parts import CHUNK, HEAD, MAGIC, MESSAGE, Channels, read_summary, split
 from ropetrace.recordings.ros_messages import MAX_MESSAGE_BYTES, RawMessage, Topic
 
-_MESSAGE = struct.Struct("<HIQQ")
-_CHUNK = struct.Struct("<QQQII")
 _DATA_SECTION = {
     Opcode.HEADER,
     Opcode.SCHEMA,
@@ -177,15 +175,15 @@ class McapFile:
     def _chunk(self, payload: bytes, offset: int, current: _Pass) -> Iterator[RawMessage]:
         """The messages of a chunk, if its checksum fits."""
         try:
-            _, _, size, crc, name_bytes = _CHUNK.unpack_from(payload)
-            data_start = _CHUNK.size + name_bytes + 8
+            _, _, size, crc, name_bytes = CHUNK.unpack_from(payload)
+            data_start = CHUNK.size + name_bytes + 8
             (data_bytes,) = struct.unpack_from("<Q", payload, data_start - 8)
         except struct.error:
             raise DamageError(offset, "a chunk is too short") from None
         if data_start + data_bytes != len(payload):
             raise DamageError(offset, "the lengths in a chunk do not fit")
         try:
-            name = payload[_CHUNK.size : data_start - 8].decode(errors="replace")
+            name = payload[CHUNK.size : data_start - 8].decode(errors="replace")
             data = decompress(name, memoryview(payload)[data_start:], size, MAX_MESSAGE_BYTES)
             if crc and zlib.crc32(data) != crc:
                 raise DamageError(offset, "wrong checksum")
@@ -211,10 +209,10 @@ class McapFile:
             )
 
     def _message(self, record: bytes | memoryview, offset: int, current: _Pass) -> Iterator[RawMessage]:
-        if len(record) < _MESSAGE.size:
+        if len(record) < MESSAGE.size:
             note(self.problems, f"a message at byte {offset} is too short and is left out")
             return
-        channel, _, log_time, _ = _MESSAGE.unpack_from(record)
+        channel, _, log_time, _ = MESSAGE.unpack_from(record)
         known = current.known.channels.get(channel)
         if known is None:
             note(
@@ -225,7 +223,7 @@ class McapFile:
         topic, kind, encoding = known
         current.seen[topic] += 1
         if current.wanted is None or topic in current.wanted:
-            yield RawMessage(topic, kind, encoding, log_time, memoryview(record)[_MESSAGE.size :])
+            yield RawMessage(topic, kind, encoding, log_time, memoryview(record)[MESSAGE.size :])
 
     def _check_end(self, payload: bytes, offset: int, current: _Pass) -> None:
         if len(payload) != 4:

@@ -30,7 +30,7 @@ def frame_messages(frame: Frame) -> list[RawMessage]:
         If the stamp does not fit a ROS time: before 1970, after 2038.
     """
     if not 0 <= frame.stamp_ns <= LAST_STAMP:
-        raise FrameError(f"the stamp {frame.stamp_ns} ns does not fit a ROS time")
+        raise FrameError("the stamp does not fit a ROS time: before 1970, or after 2038")
     held = header(frame.stamp_ns, FRAME_ID)
     if isinstance(frame, CloudFrame):
         return [_packed(CLOUD_TOPIC, CLOUD, frame.stamp_ns, _cloud(held, frame))]

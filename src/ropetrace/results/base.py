@@ -6,8 +6,9 @@ import contextlib
 import fcntl
 import os
 import signal
+import stat
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import BinaryIO, Protocol, Self
@@ -132,8 +133,10 @@ def check_place(path: Path) -> None:
             raise OutputError(f"{path}: the folder {path.parent} does not exist")
 
 
-def create(path: Path, overwrite: bool, buffering: int = -1) -> BinaryIO:
-    """Open a new file.
+def create(
+    path: Path, overwrite: bool, buffering: int = -1, opener: Callable[[str, int], int] | None = None
+) -> BinaryIO:
+    """Open a new file; `opener` as that of the built-in `open`.
 
     Raises
     ------
@@ -142,7 +145,7 @@ def create(path: Path, overwrite: bool, buffering: int = -1) -> BinaryIO:
     """
     check_place(path)
     try:
-        return open(path, "wb" if overwrite else "xb", buffering=buffering)
+        return open(path, "wb" if overwrite else "xb", buffering=buffering, opener=opener)
     except FileExistsError:
         raise OutputError(f"{path} exists already: choose another name or give --overwrite") from None
     except OSError as error:
@@ -178,18 +181,26 @@ class WholeFile:
     """A file that takes each piece of data whole or, where the disk is full, not at all.
 
     There is no buffer in the process: when `append` returns the system has the data, and a kill cannot take
-    them.
+    them. What was in the file before is there until the first `append`. Another process that would write to it
+    meanwhile is refused by a lock.
 
     Raises
     ------
     OutputError
-        If the file cannot be created or written.
+        If the file cannot be created or written, or another process writes to it.
     """
 
     def __init__(self, path: Path, overwrite: bool) -> None:
         self._path = path
-        self._file = create(path, overwrite, buffering=0)
+        self._is_new = not os.path.lexists(path)
+        self._file = create(path, overwrite, buffering=0, opener=_keeping)
         self.size = 0
+        # Devices and pipes can be shared, and have nothing to be cut off.
+        self._is_regular = stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
+        self._is_begun = False
+        if self._is_regular:
+            with self.closed_on_error():
+                lock(self._file, path)
 
     @contextlib.contextmanager
     def closed_on_error(self) -> Iterator[None]:
@@ -204,6 +215,9 @@ class WholeFile:
         """Write all of the data, or raise and leave the file as it was."""
         written = 0
         with writing(self._path), uninterrupted(), memoryview(data) as view:
+            if self._is_regular and not self._is_begun:
+                self._file.truncate(0)
+            self._is_begun = True
             try:
                 while written < len(view):
                     written += self._file.write(view[written:])
@@ -213,10 +227,6 @@ class WholeFile:
                     self._file.truncate()
                 raise
             self.size += written
-
-    def lock(self) -> None:
-        """Have every other process that locks the file refused, as long as it is open here."""
-        lock(self._file, self._path)
 
     def sync(self) -> None:
         """Wait until the disk has all that was written."""
@@ -228,9 +238,21 @@ class WholeFile:
         with writing(self._path):
             self._file.close()
 
+    def discard(self) -> None:
+        """Close the file as if it had never been opened: a new one is removed, and one with data of this run too."""
+        with writing(self._path):
+            if self._is_regular and (self._is_new or self._is_begun):
+                self._path.unlink(missing_ok=True)
+            self._file.close()
+
+
+def _keeping(path: str, flags: int) -> int:
+    """Open a file, and leave what is in it until it is locked."""
+    return os.open(path, flags & ~os.O_TRUNC, 0o666)
+
 
 def lock(file: BinaryIO | int, path: Path) -> None:
-    """Lock an open file or folder until it is closed.
+    """Lock a file that is open for writing until it is closed.
 
     Raises
     ------

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ropetrace.errors import FrameError, OutputError
 from ropetrace.recordings.mcap_append import McapAppender
+from ropetrace.recordings.ros_frames import FRAME_ID
 from ropetrace.recordings.ros_messages import RawMessage
 from ropetrace.results.base import Closing
 from ropetrace.results.ros_estimates import (
@@ -44,6 +45,11 @@ class McapWriter(Closing):
         self._path = path
         self._messages = EstimateMessages(frame_name)
         self._file = McapAppender(path, overwrite, {METADATA: {**metadata, "frame_name": frame_name}})
+        try:
+            self._file.begin()
+        except BaseException:
+            self._file.close()
+            raise
 
     def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
         try:
@@ -72,7 +78,7 @@ class EstimateMessages:
     """
 
     def __init__(self, frame_name: str) -> None:
-        self._frame_id = "camera_color_optical_frame" if frame_name == "camera" else frame_name
+        self._frame_id = FRAME_ID if frame_name == "camera" else frame_name
         self._with_cloud: set[int] = set()
 
     def of(self, estimate: Estimate) -> list[RawMessage]:
@@ -87,7 +93,7 @@ class EstimateMessages:
         held_ns = stamp_ns + estimate.ahead_ns
         for name, time_ns in (("stamp", stamp_ns), ("predicted time", held_ns)):
             if not 0 <= time_ns <= LAST_STAMP:
-                raise FrameError(f"the {name} {time_ns} ns does not fit a ROS time")
+                raise FrameError(f"the {name} does not fit a ROS time: before 1970, or after 2038")
         frame_id, waypoints = self._frame_id, estimate.waypoints
         status = estimate_status(header(stamp_ns, frame_id), estimate)
         messages = [
