@@ -15,18 +15,20 @@ import time
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from helpers import DATA, needs_data
-from ropetrace import cli, demo
+from ropetrace import cli, cli_track, demo, terminal
 from ropetrace.recordings.mcap_file import McapFrameWriter
 from ropetrace.recordings.rgbd_folder import RgbdFolderWriter
 from ropetrace.results.base import COLUMNS
 from ropetrace.sim.camera import Capsules, RayCaster, Scene
 from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, NOTHING_FOUND
+from ropetrace.tracking import track_recording
 from ropetrace.types import Intrinsics, RgbdFrame
 
 CAMERA = Intrinsics(160, 120, 145.0, 145.0, 79.5, 59.5)
@@ -539,6 +541,46 @@ def test_an_interrupted_run_leaves_what_it_had(tmp_path: Path) -> None:
 
     assert len(set(pyarrow.parquet.read_table(tmp_path / "r.parquet")["frame"].to_pylist())) == len(frames)
     assert f"frames    {len(frames)} " in out
+
+
+def test_without_a_screen_earlier_results_stay(
+    run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rerun", reason="rerun is not installed: ropetrace[viewer]")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    for name in ("r.csv", "r.csv.toml"):
+        (tmp_path / name).write_text("earlier")
+    code, _, err = run("track", folder, "-d", "24mm", "-c", COLOR, "--out", "r.csv", "--overwrite", "--view")
+    assert code == BAD_INPUT
+    assert "no screen" in err
+    assert [(tmp_path / name).read_text() for name in ("r.csv", "r.csv.toml")] == ["earlier"] * 2
+
+
+def test_ctrl_c_ends_a_run_after_the_frame_that_is_worked_on(
+    run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An exception out of a callback of the compiler would be swallowed there, or become a SystemError."""
+    told: list[int] = []
+    monkeypatch.setattr(terminal, "INTERRUPTS", told)
+    monkeypatch.setattr(cli_track, "INTERRUPTS", told)
+
+    def frame_by_frame(frames: Any, tracker: Any, *arguments: Any, **options: Any) -> Any:
+        update = tracker.update_all
+
+        def interrupted(*given: Any) -> Any:
+            signal.raise_signal(signal.SIGINT)
+            return update(*given)
+
+        tracker.update_all = interrupted
+        return track_recording(frames, tracker, *arguments, **options)
+
+    monkeypatch.setattr("ropetrace.tracking.track_recording", frame_by_frame)
+    code, out, err = run("track", folder, "-d", "24mm", "-c", COLOR, "--out", "r.csv")
+    assert code == INTERRUPTED
+    assert "frames    1 (1 ok" in out
+    assert "what was tracked until then is written" in err
+    assert list(statuses(tmp_path / "r.csv")) == [0]
 
 
 def test_piped_output_has_no_progress_bar(folder: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import os
 import re
@@ -23,11 +24,12 @@ pytest.importorskip("mujoco")
 pytest.importorskip("rerun")
 
 from result_examples import estimate
-from ropetrace import cli, cli_track
+from ropetrace import cli, cli_track, serving_gate
 from ropetrace.cli_serve import _View
 from ropetrace.errors import ConfigError, OutputError
+from ropetrace.results.feed import stop_rerun
 from ropetrace.serving import ViewServer
-from ropetrace.serving_gate import READ_PATH, WAITING_BYTES, Gate, Request
+from ropetrace.serving_gate import READ_PATH, Gate, Request
 from ropetrace.terminal import BAD_INPUT
 from ropetrace.types import BadFrame
 
@@ -273,19 +275,25 @@ def test_further_out_one_needs_the_key() -> None:
     assert answer is not None
     head = answer.decode()
     assert head.startswith("HTTP/1.1 302 ")
-    assert f"Set-Cookie: ropetrace_{gate.port}={key}; Path=/; HttpOnly; SameSite=Strict" in head
+    assert f"Set-Cookie: ropetrace_{gate.port}={key}; Path=/; HttpOnly; SameSite=Lax" in head
     assert key not in head.partition("Location: ")[2].partition("\r\n")[0]
     assert gate.answer(request("/?url=x", Host="robot:9090", Cookie=f"ropetrace_{gate.port}={key}")) is None
-    foreign = gate.answer(request(f"/?url=x&key={key}", Host="robot:9090", Origin="http://evil.example"))
-    assert foreign is not None
-    assert foreign.startswith(b"HTTP/1.1 403 ")
+    # Cookies of other servers of that machine may be anything.
+    foreign = 'settings={"a": [1, 2]}; x' + f"ropetrace_{gate.port}=wrong; ropetrace_{gate.port}={key}; b=c"
+    assert gate.answer(request("/?url=x", Host="robot:9090", Cookie=foreign)) is None
+    answer = gate.answer(request(f"/?url=x&key={key}", Host="robot:9090", Origin="http://evil.example"))
+    assert answer is not None
+    assert answer.startswith(b"HTTP/1.1 403 ")
     gate.close()
 
 
-def test_a_viewer_that_does_not_read_holds_up_nobody() -> None:
-    """What stands for Rerun sends four times what may wait, and must get rid of it; the viewer then reads the rest."""
+def test_a_viewer_that_does_not_read_holds_up_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What stands for Rerun sends far more than may wait, and must get rid of it; the viewer then reads the rest."""
+    monkeypatch.setattr(serving_gate, "WAITING_BYTES", 4 << 20)
+    monkeypatch.setattr(serving_gate, "STUCK_SECONDS", PATIENCE)
     message = b"\0" + (1 << 20).to_bytes(4, "big") + bytes(1 << 20)
-    count = 4 * (WAITING_BYTES >> 20)
+    # The kernel holds some, too.
+    count = 64
     sent = threading.Event()
 
     def send(server: socket.socket) -> None:
@@ -313,6 +321,174 @@ def test_a_viewer_that_does_not_read_holds_up_nobody() -> None:
     assert 0 < len(received) // len(message) < count
 
 
+def test_a_viewer_that_takes_nothing_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serving_gate, "STUCK_SECONDS", 0.2)
+    # More than the kernel holds.
+    size = 24 << 20
+    ended = threading.Event()
+
+    def send(server: socket.socket) -> None:
+        connection, _ = server.accept()
+        with connection, contextlib.suppress(OSError):
+            connection.recv(1 << 16)
+            head = b"HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n"
+            connection.sendall(head + b"%x\r\n\0" % (size + 5) + size.to_bytes(4, "big") + bytes(size) + b"\r\n")
+            while connection.recv(1 << 16):
+                pass
+        ended.set()
+
+    gate = Gate("127.0.0.1", 0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=send, args=(server,), daemon=True).start()
+        gate.open(server.getsockname(), server.getsockname())
+        answer = ask(gate.url, "POST", READ_PATH, NOTHING)
+        assert ended.wait(PATIENCE)
+        until(lambda: not gate._connections)
+        received = b""
+        with contextlib.suppress(http.client.IncompleteRead, OSError):
+            while piece := answer.read1(1 << 20):
+                received += piece
+    gate.close()
+    assert 0 < len(received) < size
+
+
+@contextmanager
+def idle_gate() -> Iterator[Gate]:
+    """A gate before something that takes connections, and says nothing."""
+    gate = Gate("127.0.0.1", 0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        gate.open(server.getsockname(), server.getsockname())
+        try:
+            yield gate
+        finally:
+            gate.close()
+
+
+def test_viewers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serving_gate, "MOST_VIEWERS", 2)
+    monkeypatch.setattr(serving_gate, "HEAD_SECONDS", PATIENCE)
+    with idle_gate() as gate:
+        viewers = [http.client.HTTPConnection("127.0.0.1", gate.port, timeout=PATIENCE) for _ in range(2)]
+        for viewer in viewers:
+            viewer.request("POST", READ_PATH, NOTHING)
+        until(lambda: gate._viewers == 2)
+        assert ask(gate.url, "POST", READ_PATH, NOTHING).status == 503
+        assert ask(gate.url, "GET", "/").status == 302
+        viewers[0].close()
+        until(lambda: gate._viewers == 1)
+        viewers[0].request("POST", READ_PATH, NOTHING)
+        until(lambda: gate._viewers == 2)
+        for viewer in viewers:
+            viewer.close()
+
+
+def test_connections_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serving_gate, "MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(serving_gate, "HEAD_SECONDS", PATIENCE)
+    with idle_gate() as gate:
+        silent = [socket.create_connection(("127.0.0.1", gate.port), PATIENCE) for _ in range(3)]
+        until(lambda: gate._connections == 3)
+        assert ask(gate.url, "GET", "/").status == 503
+        silent.pop().close()
+        until(lambda: gate._connections == 2)
+        assert ask(gate.url, "GET", "/").status == 302
+        for connection in silent:
+            connection.close()
+
+
+@pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="there is no IPv6 here")
+def test_all_networks_are_those_of_both_kinds() -> None:
+    gate = Gate("::", 0)
+    gate.open(("127.0.0.1", 1), ("127.0.0.1", 1))
+    assert gate.key
+    for address in ("127.0.0.1", "::1"):
+        connection = http.client.HTTPConnection(address, gate.port, timeout=PATIENCE)
+        connection.request("GET", f"/?key={gate.key}")
+        assert connection.getresponse().status == 302
+    gate.close()
+
+
+def test_a_second_ctrl_c_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    view = ViewServer("127.0.0.1", 0)
+    stop = view._feed.stop
+
+    def interrupted(timeout: float | None = None) -> None:
+        if timeout is not None:
+            raise KeyboardInterrupt
+        stop()
+
+    monkeypatch.setattr(view._feed, "stop", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        view.close()
+    assert view.problem is not None
+    assert not view._feed.running
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", view._gate.port), PATIENCE)
+
+
+def test_a_view_that_cannot_be_fed_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended: list[int] = []
+
+    def stop(process: subprocess.Popen[bytes]) -> None:
+        stop_rerun(process)
+        ended.append(process.wait())
+
+    monkeypatch.setattr("ropetrace.serving.stop_rerun", stop)
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise ValueError("no log")
+
+    monkeypatch.setattr("ropetrace.serving.RerunLog", fail)
+    with pytest.raises(ValueError, match="no log"):
+        ViewServer("127.0.0.1", 0)
+    assert ended == [-signal.SIGKILL]
+
+
+def test_the_world_needs_the_pose_before_the_address_is_told(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "ropetrace", "serve", "sim:still", *ROPE, "--frame", "world", "--port", "0"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert (done.returncode, done.stdout) == (BAD_INPUT, "")
+    assert done.stderr == "ropetrace: --frame world needs camera_pose in the config\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["serve", "--port", "0", *ROPE], 0),
+        (["serve", "--port", "0", "--diameter", "15mm"], 0),
+        (["track", "--diameter", "15mm"], 1),
+    ],
+    ids=["looking for colour", "serve", "track"],
+)
+def test_ctrl_c_ends_the_wait_for_the_first_frame(arguments: list[str], expected: int, tmp_path: Path) -> None:
+    """A camera is silent; what waits for half a minute says when it begins to."""
+    program = f"""
+import sys
+import ropetrace.live.stream as stream
+take = stream.Stream.take
+def told(self, timeout):
+    print("waiting", flush=True)
+    return take(self, timeout)
+stream.Stream.take = told
+stream.Stream._fetch_while_there = lambda self: self._stopping.wait()
+sys.argv = ["ropetrace", *{arguments}, "sim:still"]
+from ropetrace.cli import main
+main()
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", program], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        lines = process.stdout
+        until(lambda: lines.readline() == "waiting\n")
+        begun = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        code, _, err = ended(process)
+    assert time.monotonic() - begun < 20
+    assert "gave no frame" not in err
+    assert code == expected
+
+
 def test_a_view_that_ended_is_told_once_or_ends_the_run(capsys: pytest.CaptureFixture[str]) -> None:
     with ViewServer("127.0.0.1", 0) as view:
         view._rerun.end()
@@ -321,7 +497,7 @@ def test_a_view_that_ended_is_told_once_or_ends_the_run(capsys: pytest.CaptureFi
         kept.write(1, estimate(1), None, None)
         with pytest.raises(OutputError, match="rerun stopped with code -9"):
             _View(view, needed=True).write(0, estimate(0), None, None)
-        view.wait(lambda: False)
+        view.wait()
     assert capsys.readouterr().err.count("the tracking goes on") == 1
 
 
@@ -333,9 +509,9 @@ def test_a_recording_is_shown_at_its_own_pace(monkeypatch: pytest.MonkeyPatch) -
     # A second each, one that runs back, and an hour without frames.
     for event in cli_track.at_own_pace(BadFrame(round(stamp * 1e9), "-") for stamp in (5.0, 6.0, 7.0, 6.5, 3600.0)):
         came.append((event.stamp_ns / 1e9, round(now[0] - 100.0, 6)))
-        # Whoever is slower than the recording is not made to wait as well.
+        # Whoever is slower than the recording is not made to wait as well, and what follows is not rushed.
         now[0] += 1.5 if event.stamp_ns == 6 * 10**9 else 0.0
-    assert came == [(5.0, 0.0), (6.0, 1.0), (7.0, 2.5), (6.5, 2.5), (3600.0, 2.0 + cli_track.LONGEST_GAP)]
+    assert came == [(5.0, 0.0), (6.0, 1.0), (7.0, 2.5), (6.5, 2.5), (3600.0, 2.5 + cli_track.LONGEST_GAP)]
 
 
 @pytest.mark.parametrize(

@@ -606,6 +606,19 @@ def test_a_rope_that_appears_later_is_taken_up(ropes: int | Literal["auto"]) -> 
     assert [estimate.status for estimate in estimates] == [Status.OK] * 2
 
 
+def test_ropes_are_not_taken_up_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ropetrace.trackers.persistent.MOST_ROPES", 2)
+    late, crowded = tracker("auto"), tracker("auto")
+    for index in range(20):
+        curves = [hanging(index / RATE, x=x, length=0.4) for x in (-0.2, 0.0, 0.2)]
+        estimates = update_all(late, view(curves[: 2 if index < 5 else 3], index / RATE))
+        assert len(update_all(crowded, view(curves, index / RATE))) == 2
+        if index < 5:
+            assert [estimate.status for estimate in estimates] == [Status.OK] * 2
+    assert len(estimates) == 2
+    assert all(says(estimate, "2 ropes are followed already: no more") for estimate in estimates)
+
+
 def test_that_fewer_ropes_are_seen_than_wanted_is_told() -> None:
     curves = [hanging(0.0, x=x, length=0.4) for x in (-0.12, 0.12)]
     rope = tracker(3)

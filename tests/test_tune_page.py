@@ -33,7 +33,7 @@ from ropetrace.errors import ConfigError, OutputError, RecordingError
 from ropetrace.picture import backdrop, pixels_of
 from ropetrace.recordings import Recording, open_recording
 from ropetrace.trackers import make_tracker
-from ropetrace.tune_page import TunePage, refusal
+from ropetrace.tune_page import TunePage, _Seat, refusal
 from ropetrace.tuning import Tuning
 from ropetrace.types import BadFrame, CloudFrame, Intrinsics, RgbdFrame, Status
 from test_live import ScriptedCamera, live
@@ -156,15 +156,90 @@ def test_a_socket_without_the_token_is_refused(serve: Callable[..., TunePage]) -
 
 
 def test_who_is_let_in() -> None:
-    assert refusal("localhost:9000", "http://localhost:9000", "t", "t") is None
-    assert refusal("192.168.0.7:80", "http://192.168.0.7:80", "t", "t") is None
-    assert refusal("[::1]:80", None, "t", "t") is None
-    assert "host" in (refusal("", None, "t", "t") or "")
-    assert "host" in (refusal("[", None, "t", "t") or "")
-    assert "host" in (refusal("evil.example", "http://evil.example", "t", "t") or "")
-    assert "origin" in (refusal("localhost:9000", "http://localhost:9001", "t", "t") or "")
-    assert "token" in (refusal("localhost", None, "t", "") or "")
-    assert "token" in (refusal("localhost", None, "t", "ü") or "")
+    def why(host: str, origin: str | None, given: str = "t", on_loopback: bool = True) -> str:
+        return refusal(host, origin, "t", given, on_loopback=on_loopback) or ""
+
+    assert why("localhost:9000", "http://localhost:9000") == ""
+    assert why("[::1]:80", None) == ""
+    # Further out a machine may have any name.
+    for name in ("192.168.0.7:80", "robot.lab.example:80"):
+        assert "host" in why(name, f"http://{name}")
+        assert why(name, f"http://{name}", on_loopback=False) == ""
+        assert "token" in why(name, f"http://{name}", "", on_loopback=False)
+        assert "origin" in why(name, "http://evil.example", on_loopback=False)
+    for on_loopback in (True, False):
+        assert "host" in why("", None, on_loopback=on_loopback)
+        assert "host" in why("[", None, on_loopback=on_loopback)
+    assert "origin" in why("localhost:9000", "http://localhost:9001")
+    assert "token" in why("localhost", None, "")
+    assert "token" in why("localhost", None, "ü")
+
+
+def test_an_address_that_is_none_is_told(serve: Callable[..., TunePage]) -> None:
+    page = serve()
+    assert request(page, "//[")[0] == 400
+
+
+def test_pages_are_bounded(serve: Callable[..., TunePage], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ropetrace.tune_page._MOST_BROWSERS", 1)
+    page = serve()
+    with open_socket(page) as line:
+        looked(line)
+        with pytest.raises(exceptions.InvalidStatus) as caught, open_socket(page):
+            pass
+        assert caught.value.response.status_code == 503
+
+
+def test_a_browser_that_takes_nothing_is_cut_off(
+    serve: Callable[..., TunePage], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ropetrace.tune_page._STUCK", 0.3)
+    monkeypatch.setattr(TunePage, "_text_of_newest", lambda page: (page._version, page._shown, " " * (32 << 20)))
+    page = serve()
+    with socket.create_connection(("127.0.0.1", page.port)) as gone:
+        head = f"GET /socket?token={page.token} HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\n"
+        head += f"Origin: http://127.0.0.1:{page.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        gone.sendall(f"{head}Sec-WebSocket-Key: {'A' * 22}==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode())
+        assert b" 101 " in gone.recv(100)
+        end = time.monotonic() + _PATIENCE
+        while page._server.connections or page._server.handler_threads:
+            assert time.monotonic() < end, "it is waited for"
+            time.sleep(0.05)
+
+
+def test_a_page_that_cannot_be_made_is_closed(
+    serve: Callable[..., TunePage], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(page: TunePage) -> Any:
+        raise ZeroDivisionError("nothing to divide")
+
+    monkeypatch.setattr(TunePage, "_text_of_newest", fail)
+    page = serve()
+    with open_socket(page) as line, pytest.raises(exceptions.ConnectionClosedError) as caught:
+        line.recv(timeout=_PATIENCE)
+    assert caught.value.rcvd.code == 1011
+    assert "ZeroDivisionError: nothing to divide" in capsys.readouterr().err
+
+
+def test_what_is_sent_meanwhile_does_not_break_a_click(serve: Callable[..., TunePage]) -> None:
+    page = serve()
+    with open_socket(page) as line:
+        looked(line)
+
+    class Sent:
+        event = None
+
+        @property
+        def index(self) -> int:
+            # As if the sender had sent another one just now.
+            seat.sent.append(self)  # type: ignore[arg-type]
+            return 0
+
+    seat = _Seat()
+    seat.sent.extend([Sent(), Sent()])  # type: ignore[list-item]
+    column, row = on_the_rope()
+    page._do({"do": "click", "index": 5, "column": column, "row": row}, seat)
+    assert tuning_of(page).config.color is not None
 
 
 def test_two_pages_show_the_same(serve: Callable[..., TunePage]) -> None:
@@ -341,10 +416,37 @@ def test_a_camera_that_vanishes_is_told_and_comes_back(serve: Callable[..., Tune
         assert state["look"]["picture"] is None
         assert "when it returns" in state["look"]["advice"]["text"]
         # It is given up for good, and begun anew for good.
-        until(line, lambda message: "start anew" in message["state"]["look"]["bad"])
+        until(line, lambda message: "it is there, but silent" in message["state"]["look"]["bad"])
         assert talk(line, do="save", replace=False)["said"]
         away.clear()
         until(line, lambda message: message["state"]["look"]["ropes"][0]["status"] == "ok")
+
+
+def test_a_request_is_answered_while_a_silent_camera_is_waited_for(serve: Callable[..., TunePage]) -> None:
+    away = threading.Event()
+    frame_at = scene()
+    camera = ScriptedCamera(lambda index: None if away.is_set() else frame_at(index), 0.03)
+    recording = live(camera, silence=0.1, give_up=0.3)
+    waiting = threading.Event()
+    page = serve(RopeConfig(0.012, RED_TEXT), recording=recording)
+    with open_socket(page) as line:
+        looked(line)
+        away.set()
+        until(line, lambda message: "it is there, but silent" in message["state"]["look"]["bad"])
+        # It is begun anew, and waited for.
+        recording._give_up = 2 * _PATIENCE
+        tuning = tuning_of(page)
+        take = tuning.take
+
+        def told() -> bool:
+            waiting.set()
+            return take()
+
+        tuning.take = told  # type: ignore[method-assign]
+        assert waiting.wait(_PATIENCE)
+        assert talk(line, do="set", settings={"diameter": 0.0131})["look"]["settings"]["diameter"] == 0.0131
+        away.clear()
+        until(line, lambda message: message["state"]["look"]["ropes"])
 
 
 def test_live_frames_of_changing_size(serve: Callable[..., TunePage]) -> None:
@@ -369,7 +471,8 @@ def test_a_page_for_the_whole_network_wants_its_token_too(serve: Callable[..., T
     page = serve(bind="0.0.0.0")
     assert page.url.startswith(f"http://{socket.gethostname()}:{page.port}/?token=")
     assert request(page, "/")[0] == 403
-    assert request(page, f"/?token={page.token}", Host=f"{socket.gethostname()}:{page.port}")[0] == 200
+    for name in (socket.gethostname(), "robot.lab.example"):
+        assert request(page, f"/?token={page.token}", Host=f"{name}:{page.port}")[0] == 200
 
 
 def test_the_command_serves_until_it_is_interrupted(folder: Path, tmp_path: Path) -> None:
@@ -401,6 +504,8 @@ def test_the_command_closes_a_live_source_when_it_is_interrupted(tmp_path: Path)
 
 def test_the_command_refuses_before_it_serves(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "rope.toml"
+    with pytest.raises(ConfigError, match=r"--bind no\.such\.host\.invalid: there is no such address"):
+        Tune(Source(folder, Part()), TrackedRope(), out, bind="no.such.host.invalid").run()
     with pytest.raises(ConfigError, match="--port"):
         Tune(Source(folder, Part()), TrackedRope(), out, port=-1).run()
     for place in (tmp_path, tmp_path / "nowhere" / "rope.toml"):

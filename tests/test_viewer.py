@@ -1,9 +1,10 @@
 from __future__ import annotations
 
 import dataclasses
+import queue
 import subprocess
 import sys
-import time
+import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,12 +18,15 @@ from scipy.spatial.transform import Rotation
 
 from result_examples import FIRST_STAMP, REASONS, cloud, estimate, frame, helix, motion, told
 from ropetrace.errors import OutputError
-from ropetrace.results import live, open_writer
+from ropetrace.results import feed, live, open_writer
+from ropetrace.results.feed import Feed, stop_rerun
 from ropetrace.results.live import LiveViewer
 from ropetrace.results.rrd import RrdWriter
 from ropetrace.types import Cloud, CloudFrame, Estimate, Frame, Status, Waypoints
 from ropetrace.viewer import CLOUD_POINTS, IMAGE_WIDTH, NO_NODE_COLOR, ArmView, RerunLog, new_recording
 from ropetrace.viewer_shapes import AXES, NODE_COLORS, VELOCITY_COLOR, VELOCITY_SECONDS, rope_color
+
+PATIENCE = 60.0
 
 Rows = dict[str, dict[int | None, dict[str, Any]]]
 
@@ -375,45 +379,96 @@ def listening(port: int) -> set[str]:
     return found
 
 
-def test_the_viewer_never_slows_the_tracker(viewer: LiveViewer, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = []
+class Slow:
+    """Takes pictures, and holds the first one until `release`."""
 
-    def slow(index: int, *_: Any) -> None:
-        time.sleep(0.1)
-        shown.append(index)
+    def __init__(self) -> None:
+        self.shown: list[tuple[int, int]] = []
+        self.entered, self.release = threading.Event(), threading.Event()
 
-    monkeypatch.setattr(viewer._log, "log", slow)
-    started = time.monotonic()
-    for index in range(50):
-        viewer.write(index, estimate(index))
-        time.sleep(0.01)
-    assert time.monotonic() - started < 0.9
+    def log(self, index: int, item: Estimate, *_: Any) -> None:
+        self.entered.set()
+        assert self.release.wait(PATIENCE), "the caller waits for the picture"
+        self.shown.append((index, item.rope))
+
+
+def test_a_feed_never_makes_its_caller_wait() -> None:
+    slow = Slow()
+    fed = Feed("viewer", new_recording(), slow.log, lambda: True)
+    fed.write(0, estimate(0))
+    assert slow.entered.wait(PATIENCE)
+    for index in range(1, 50):
+        fed.write(index, estimate(index))
+    assert fed.running
+    slow.release.set()
+    fed.stop(PATIENCE)
+    fed.stop(PATIENCE)
+    assert slow.shown == [(0, 0), (49, 0)]
+    assert fed.skipped == 48
+    assert not fed.running
+
+
+def test_the_ropes_of_a_frame_are_shown_together() -> None:
+    slow = Slow()
+    fed = Feed("viewer", new_recording(), slow.log, lambda: True)
+    fed.write(0, told(0, 0))
+    assert slow.entered.wait(PATIENCE)
+    for index in range(1, 10):
+        for rope in range(2):
+            fed.write(index, told(index, rope))
+    slow.release.set()
+    fed.stop(PATIENCE)
+    assert slow.shown == [(0, 0), (9, 0), (9, 1)]
+    assert fed.skipped == 8
+
+
+def test_a_picture_that_fails_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = []
+    monkeypatch.setattr(warnings, "warn", lambda message, *_, **__: told.append(message))
+    tried: queue.Queue[int] = queue.Queue()
+
+    def fail(index: int, *_: Any) -> None:
+        tried.put(index)
+        raise ValueError("no picture")
+
+    fed = Feed("viewer", new_recording(), fail, lambda: True)
+    for index in range(5):
+        fed.write(index, estimate(index))
+        assert tried.get(timeout=PATIENCE) == index
+    fed.stop(PATIENCE)
+    assert told == ["the viewer misses frames: no picture"]
+    assert fed.skipped == 5
+
+
+def test_the_viewer_is_fed_and_ends(viewer: LiveViewer) -> None:
+    viewer.write(0, estimate(0), frame(0), cloud(0))
     assert viewer.running
     viewer.close(keep_window=False)
     viewer.close(keep_window=False)
-    assert shown[0] == 0
-    assert shown[-1] == 49
-    assert shown == sorted(shown)
-    assert len(shown) + viewer.skipped == 50
     assert not viewer.running
+    assert viewer.skipped == 0
 
 
-def test_the_ropes_of_a_frame_are_shown_together(viewer: LiveViewer, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = []
+def test_an_app_that_hangs_does_not_outlive_a_second_ctrl_c(
+    viewer: LiveViewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = Slow()
+    monkeypatch.setattr(viewer._feed, "_log", slow.log)
+    viewer.write(0, estimate(0))
+    assert slow.entered.wait(PATIENCE)
+    stop = viewer._feed.stop
 
-    def slow(index: int, item: Estimate, *_: Any) -> None:
-        time.sleep(0.05)
-        shown.append((index, item.rope))
+    def interrupted(timeout: float | None = None) -> None:
+        if timeout is not None:
+            raise KeyboardInterrupt
+        slow.release.set()
+        stop()
 
-    monkeypatch.setattr(viewer._log, "log", slow)
-    for index in range(10):
-        for rope in range(2):
-            viewer.write(index, told(index, rope))
-        time.sleep(0.01)
-    viewer.close(keep_window=False)
-    assert shown[-2:] == [(9, 0), (9, 1)]
-    assert viewer.skipped > 0
-    assert shown == sorted(shown)
+    monkeypatch.setattr(viewer._feed, "stop", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        viewer.close()
+    assert not viewer.running
+    monkeypatch.undo()
 
 
 def test_the_viewer_listens_to_this_machine_only(viewer: LiveViewer) -> None:
@@ -422,25 +477,30 @@ def test_the_viewer_listens_to_this_machine_only(viewer: LiveViewer) -> None:
 
 def test_closing_the_window_does_not_stop_the_run(viewer: LiveViewer) -> None:
     viewer.write(0, estimate(0), frame(0), cloud(0))
-    live._stop_app(viewer._app)
+    stop_rerun(viewer._app)
+    assert not viewer.running
     for index in range(1, 20):
         viewer.write(index, estimate(index), frame(index), cloud(index))
-        time.sleep(0.005)
-    assert not viewer.running
+    viewer.close()
+    viewer.write(20, estimate(20))
     assert viewer.skipped > 10
 
 
-def test_a_picture_that_fails_is_told_once(viewer: LiveViewer, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = []
-    monkeypatch.setattr(warnings, "warn", lambda message, *_, **__: told.append(message))
+def test_a_viewer_that_cannot_be_fed_leaves_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    apps = []
 
-    def fail(index: int, *_: Any) -> None:
-        raise ValueError("no picture")
+    def started(*arguments: Any, **options: Any) -> Any:
+        apps.append(feed.start_rerun(*arguments, **options))
+        return apps[-1]
 
-    monkeypatch.setattr(viewer._log, "log", fail)
-    for index in range(5):
-        viewer.write(index, estimate(index))
-        time.sleep(0.02)
-    viewer.close(keep_window=False)
-    assert told == ["the viewer misses frames: no picture"]
-    assert viewer.skipped == 5
+    def fail(*_: Any, **__: Any) -> None:
+        raise ValueError("no log")
+
+    monkeypatch.setattr(live, "start_rerun", started)
+    monkeypatch.setattr(live, "RerunLog", fail)
+    try:
+        with pytest.raises(ValueError, match="no log"):
+            LiveViewer(arguments=("--headless",))
+    except OutputError as error:
+        pytest.skip(f"no software renderer here: {error}")
+    assert apps[0].poll() is not None

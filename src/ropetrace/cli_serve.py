@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import signal
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, arg
 
 from ropetrace.cli_source import Source, TrackedRope
-from ropetrace.cli_track import Results, prediction, track
+from ropetrace.cli_track import Results, pose_of, prediction, track
 from ropetrace.errors import OutputError
 from ropetrace.terminal import INTERRUPTS
 
 if TYPE_CHECKING:
+    from ropetrace.config import RopeConfig
+    from ropetrace.recordings import Recording
     from ropetrace.serving import ViewServer
 
 
@@ -35,38 +37,48 @@ class Serve:
     """Listen on this port; 0: any that is free."""
 
     def run(self) -> int:
-        from ropetrace.live import LiveRecording
         from ropetrace.serving import ViewServer
 
         config = self.rope.settings(self.source.first_frames)
         predict = prediction(self.results.predict, config)
+        pose = pose_of(config, self.results.frame)
         recording = self.source.open()
-        pose = config.world_from_camera() if self.results.frame == "world" and config.camera_pose else None
         with ViewServer(self.host, self.port, frame_name=self.results.frame, frame_from_camera=pose) as view:
             self._tell(view)
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, _end)
-            code = track(
-                recording,
-                config,
-                list(self.results.out),
-                predict=predict,
-                start=self.source.part.start,
-                limit=self.source.part.limit,
-                mask=self.results.mask,
-                frame=self.results.frame,
-                overwrite=self.results.overwrite,
-                extra_sinks=[_View(view, needed=not self.results.out)],
-                inputs=[path for path in (self.rope.config, self.results.mask) if path is not None],
-                served=True,
-            )
-            if view.skipped:
-                print(f"view      skipped {view.skipped} frames to keep up")
-            if not INTERRUPTS and not isinstance(recording, LiveRecording) and view.problem is None:
-                print("the recording is over; the view stays until Ctrl-C", flush=True)
-                view.wait(lambda: bool(INTERRUPTS))
-                if view.problem is not None:
-                    raise OutputError(f"{view.problem}: start it again")
+            try:
+                return self._track(view, recording, config, predict)
+            except KeyboardInterrupt:
+                # The ordinary end, also where no frame has come yet; the second one is in earnest.
+                if len(INTERRUPTS) > 1:
+                    raise
+                return 0
+
+    def _track(
+        self, view: ViewServer, recording: Recording, config: RopeConfig, predict: float | Literal["now"]
+    ) -> int:
+        from ropetrace.live import LiveRecording
+
+        code = track(
+            recording,
+            config,
+            list(self.results.out),
+            predict=predict,
+            start=self.source.part.start,
+            limit=self.source.part.limit,
+            mask=self.results.mask,
+            frame=self.results.frame,
+            overwrite=self.results.overwrite,
+            extra_sinks=[_View(view, needed=not self.results.out)],
+            inputs=[path for path in (self.rope.config, self.results.mask) if path is not None],
+            served=True,
+        )
+        if view.skipped:
+            print(f"view      skipped {view.skipped} frames to keep up")
+        if not INTERRUPTS and not isinstance(recording, LiveRecording) and view.problem is None:
+            print("the recording is over; the view stays until Ctrl-C", flush=True)
+            with suppress(KeyboardInterrupt):
+                view.wait()
+                raise OutputError(f"{view.problem}: start it again")
         return code
 
     def _tell(self, view: ViewServer) -> None:
@@ -77,13 +89,6 @@ class Serve:
                 file=sys.stderr,
             )
         print(f"view      {view.url}\nopen it in any browser; Ctrl-C ends it", flush=True)
-
-
-def _end(number: int, frame: object) -> None:
-    """End after the frame that is being tracked; at the second time, at once."""
-    INTERRUPTS.append(number)
-    if len(INTERRUPTS) > 1:
-        raise KeyboardInterrupt
 
 
 class _View:

@@ -17,12 +17,12 @@ from tyro.conf import OmitArgPrefixes, arg
 from ropetrace.cli_simulation import parse_duration
 from ropetrace.cli_source import Source, TrackedRope
 from ropetrace.errors import ConfigError, OutputError
-from ropetrace.terminal import DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND, progress_bar
+from ropetrace.terminal import DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND, Interruption, progress_bar
 
 if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
     from ropetrace.recordings import Recording
-    from ropetrace.types import Event
+    from ropetrace.types import Event, FloatArray
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,7 @@ def track(
     from ropetrace.trackers import make_tracker
     from ropetrace.tracking import track_recording
 
-    if frame == "world" and config.camera_pose is None:
-        raise ConfigError("--frame world needs camera_pose in the config")
+    pose = pose_of(config, frame)
     if picture is not None and frame == "world":
         raise ConfigError("--picture draws in the camera's frame: leave out --frame world")
     live = recording if isinstance(recording, LiveRecording) else None
@@ -125,12 +124,19 @@ def track(
         if path.exists() and (not overwrite or any(path.samefile(source) for source in sources)):
             raise OutputError(f"{path} exists already: choose another name or give --overwrite")
     if config.asks_for_color and mask is None and not has_color(recording, start):
-        raise ConfigError("a colour is asked for, but the recording has none: leave out the colour, or record it")
+        from ropetrace.tuning import NO_COLOR
+
+        raise ConfigError(NO_COLOR)
     tracker = make_tracker(config, None if mask is None else _mask(mask))
     resolved = config.resolved().to_toml()
-    pose = config.world_from_camera() if frame == "world" else None
     contact = None if picture is None else ContactSheet(picture)
     with ExitStack() as stack:
+        viewer = None
+        if view:
+            from ropetrace.results.live import LiveViewer
+
+            # Before the writers, which replace earlier results: there may be no screen.
+            viewer = stack.enter_context(LiveViewer(frame_name=frame, frame_from_camera=pose))
         sinks: list[Any] = [
             stack.enter_context(
                 open_writer(
@@ -141,11 +147,7 @@ def track(
         ]
         for path in outputs:
             _write_config(_settings_of(path), resolved)
-        viewer = None
-        if view:
-            from ropetrace.results.live import LiveViewer
-
-            viewer = stack.enter_context(LiveViewer(frame_name=frame, frame_from_camera=pose))
+        if viewer is not None:
             sinks.append(viewer)
         if contact is not None:
             sinks.append(contact)
@@ -156,9 +158,9 @@ def track(
         if limit is not None:
             total = limit if total is None else min(total, limit)
         events = recording.frames(start, limit)
-        with _progress(total) as advance:
+        with _progress(total) as advance, Interruption() as interruption:
             summary = track_recording(
-                at_own_pace(events) if served and live is None else events,
+                interruption.ending_waits(at_own_pace(events) if served and live is None else events),
                 tracker,
                 sinks,
                 motion=partial(make_motion, config.motion.method, config.diameter),
@@ -198,14 +200,30 @@ def track(
     return 0
 
 
+def pose_of(config: RopeConfig, frame: str) -> FloatArray | None:
+    """The camera's pose in the frame of the results, (4, 4); None for the camera's own. ConfigError if not known."""
+    if frame == "camera":
+        return None
+    if config.camera_pose is None:
+        raise ConfigError("--frame world needs camera_pose in the config")
+    return config.world_from_camera()
+
+
 def at_own_pace(events: Iterable[Event]) -> Iterator[Event]:
-    """Each event of a recording when it is due by the stamps; a gap is not waited for longer than `LONGEST_GAP`."""
+    """Each event of a recording as long after the one before as by the stamps, and not after more than `LONGEST_GAP`.
+
+    Whoever is late stays late: nothing is rushed to catch up.
+    """
     due, before = time.monotonic(), None
     for event in events:
         if before is not None:
             due += min(max(event.stamp_ns - before, 0) / 1e9, LONGEST_GAP)
         before = event.stamp_ns
-        time.sleep(max(due - time.monotonic(), 0.0))
+        now = time.monotonic()
+        if now < due:
+            time.sleep(due - now)
+        else:
+            due = now
         yield event
 
 

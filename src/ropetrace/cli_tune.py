@@ -11,13 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, arg
 
 from ropetrace.cli_source import Source, TrackedRope
-from ropetrace.errors import ConfigError, OutputError
+from ropetrace.errors import OutputError
 from ropetrace.live import scheme_of
 
 if TYPE_CHECKING:
     from ropetrace.tuning import Tuning
-
-LOOPBACK = "127.0.0.1"
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,7 @@ class Tune:
     rope: OmitArgPrefixes[TrackedRope]
     out: Annotated[Path, arg(aliases=["-o"], metavar="FILE")] = Path("rope.toml")
     """Where the page saves the settings."""
-    bind: Annotated[str, arg(metavar="ADDRESS")] = LOOPBACK
+    bind: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
     """Listen on this address; any but 127.0.0.1 lets other machines in, if they have the token of the page's address.
     It is not encrypted."""
     port: Annotated[int, arg(metavar="N")] = 0
@@ -37,18 +35,16 @@ class Tune:
     def run(self) -> int:
         from ropetrace.tune_page import TunePage
 
-        if not 0 <= self.port <= 65535:
-            raise ConfigError(f"--port {self.port}: expected 0 to 65535")
         if self.out.is_dir() or not self.out.absolute().parent.is_dir():
             raise OutputError(f"--out {self.out}: give a file in a folder that exists")
-        if self.bind != LOOPBACK:
-            print(f"warning   {self.bind} may be reached by other machines, and is not encrypted", file=sys.stderr)
         opened = None if scheme_of(self.source.recording) else self._open()
         # An interrupt is the ordinary end, also before the page runs.
         with (
             suppress(KeyboardInterrupt),
             TunePage(lambda: opened or self._open(), self.out, self.bind, self.port) as page,
         ):
+            if page.open_to_others:
+                print(f"warning   {self.bind} may be reached by other machines, and is not encrypted", file=sys.stderr)
             print(f"page      {page.url}\nopen it in a browser; Ctrl-C ends it", flush=True)
             page.run_until_interrupted()
         print(f"settings  {self.out}" if page.file.was_saved else "nothing was saved")

@@ -7,28 +7,19 @@ import ctypes
 import secrets
 import signal
 import socket
-import subprocess
 import sys
-import tempfile
-import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from ropetrace.errors import OutputError, import_extra
 from ropetrace.results.base import Closing
-from ropetrace.serving_gate import Address, Gate
+from ropetrace.results.feed import Address, Feed, start_rerun, stop_rerun
+from ropetrace.serving_gate import Gate
 from ropetrace.types import Cloud, Estimate, FloatArray, Frame
 from ropetrace.viewer import RerunLog, default_blueprint, new_recording
 
 MEMORY_LIMIT = "16MiB"
 """What Rerun keeps for browsers that come later; then it drops the oldest. A browser loads it all when it is opened."""
-
-START_SECONDS = 20.0
-"""How long Rerun may take until it listens."""
-
-SEND_SECONDS = 5.0
-"""How long Rerun may take for one frame before the next one is tried."""
 
 FLUSH_SECONDS = 0.1
 """What is logged in this time goes to the browsers together: they take few large pieces better than many small ones."""
@@ -40,8 +31,7 @@ CLOSE_SECONDS = 5.0
 class ViewServer(Closing):
     """Serves the latest estimates to browsers; a `ResultWriter` that never makes its caller wait.
 
-    `write` puts the estimate into a slot, beside those of other ropes in the same frame, and returns. A thread takes
-    them from there; what is still in the slot when the next frame comes is skipped.
+    Frames that come faster than they can be shown are skipped: see `ropetrace.results.feed.Feed`.
 
     Parameters
     ----------
@@ -56,8 +46,6 @@ class ViewServer(Closing):
         What people open.
     open_to_others : bool
         Whether other machines may get in.
-    skipped : int
-        Frames that were not shown so far, or not with all their ropes.
 
     Raises
     ------
@@ -70,26 +58,24 @@ class ViewServer(Closing):
     def __init__(
         self, host: str, port: int, *, frame_name: str = "camera", frame_from_camera: FloatArray | None = None
     ) -> None:
-        self.skipped = 0
-        self._slot: list[tuple[int, Estimate, Frame | None, Cloud | None]] = []
-        self._changed = threading.Condition()
-        self._stopping = False
         with contextlib.ExitStack() as undo:
             self._gate = Gate(host, port)
             undo.callback(self._gate.close)
             self._rerun = _Rerun()
             undo.callback(self._rerun.end)
             self._gate.open(self._rerun.page, self._rerun.stream)
+            recording = new_recording(FLUSH_SECONDS)
+            address, stream_port = self._rerun.stream
+            recording.connect_grpc(f"rerun+http://{address}:{stream_port}/proxy", default_blueprint=default_blueprint())
+            log = RerunLog(recording, frame_name=frame_name, frame_from_camera=frame_from_camera, live=True)
+            self._feed = Feed("view", recording, log.log, lambda: self.problem is None, FLUSH_SECONDS)
             undo.pop_all()
         self.url, self.open_to_others = self._gate.url, bool(self._gate.key)
-        self._recording = new_recording(FLUSH_SECONDS)
-        address, stream_port = self._rerun.stream
-        self._recording.connect_grpc(
-            f"rerun+http://{address}:{stream_port}/proxy", default_blueprint=default_blueprint()
-        )
-        self._log = RerunLog(self._recording, frame_name=frame_name, frame_from_camera=frame_from_camera, live=True)
-        self._thread = threading.Thread(target=self._feed, name="view", daemon=True)
-        self._thread.start()
+
+    @property
+    def skipped(self) -> int:
+        """Frames that were not shown so far, or not with all their ropes."""
+        return self._feed.skipped
 
     @property
     def problem(self) -> str | None:
@@ -97,49 +83,21 @@ class ViewServer(Closing):
         return self._rerun.problem
 
     def write(self, index: int, estimate: Estimate, frame: Frame | None = None, cloud: Cloud | None = None) -> None:
-        with self._changed:
-            if not self._slot or self._slot[0][0] != index:
-                self.skipped += bool(self._slot) or not self._thread.is_alive()
-                self._slot = []
-            self._slot.append((index, estimate, frame, cloud))
-            self._changed.notify()
+        self._feed.write(index, estimate, frame, cloud)
 
-    def wait(self, until: Callable[[], bool]) -> None:
-        """Wait until nothing is served any more, or `until` is true."""
-        while self.problem is None and not until():
+    def wait(self) -> None:
+        """Wait until nothing is served any more."""
+        while self.problem is None:
             time.sleep(0.1)
 
     def close(self) -> None:
         """Cut the browsers off and end Rerun; a second call does nothing."""
-        with self._changed:
-            self._stopping = True
-            self._changed.notify()
-        self._thread.join(CLOSE_SECONDS)
-        # A server that hangs holds up everything that speaks to it, the end of this process too.
-        self._rerun.end()
-        self._thread.join()
-        self._gate.close()
-
-    def _feed(self) -> None:
-        """Hand frames to Rerun, one at a time, until `close` or until it has ended."""
-        flushed = time.monotonic()
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._slot or self._stopping)
-                slot, self._slot = self._slot, []
-            if not slot or self.problem is not None:
-                break
-            try:
-                for shown in slot:
-                    self._log.log(*shown)
-                if time.monotonic() - flushed >= FLUSH_SECONDS:
-                    self._recording.flush(timeout_sec=SEND_SECONDS)
-                    flushed = time.monotonic()
-            except Exception:
-                # Whatever is wrong with a picture must not stop the tracking.
-                with self._changed:
-                    self.skipped += 1
-        self._recording.disconnect()
+        with contextlib.ExitStack() as whatever_happens:
+            whatever_happens.callback(self._gate.close)
+            whatever_happens.callback(self._feed.stop)
+            # A server that hangs holds up everything that speaks to it, the end of this process too.
+            whatever_happens.callback(self._rerun.end)
+            self._feed.stop(CLOSE_SECONDS)
 
 
 class _Rerun:
@@ -158,27 +116,9 @@ class _Rerun:
         self.page, self.stream = _free_addresses(host)
         command = [str(program), "--serve-web", "--bind", host, "--server-memory-limit", MEMORY_LIMIT]
         command += ["--port", str(self.stream[1]), "--web-viewer-port", str(self.page[1])]
-        with tempfile.TemporaryFile() as messages:
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=messages,
-                stderr=messages,
-                # Ctrl-C in the terminal is for us.
-                start_new_session=True,
-                # It calls one function of the kernel, so that other threads do not matter.
-                preexec_fn=_die_with_parent if _LINUX else None,  # noqa: PLW1509
-            )
-            try:
-                self._wait()
-            except TimeoutError:
-                self.end()
-                messages.seek(0)
-                lines = [line for line in messages.read().decode(errors="replace").splitlines() if line.strip()]
-                raise OutputError(f"the view did not start ({lines[-1].strip() if lines else 'no message'})") from None
-            except BaseException:
-                self.end()
-                raise
+        # It calls one function of the kernel, so that other threads do not matter.
+        before = _die_with_parent if _LINUX else None
+        self._process = start_rerun(command, (self.page, self.stream), name="view", before=before)
 
     @property
     def problem(self) -> str | None:
@@ -186,21 +126,7 @@ class _Rerun:
         return None if code is None else f"the view has ended: rerun stopped with code {code}"
 
     def end(self) -> None:
-        self._process.kill()
-        self._process.wait()
-
-    def _wait(self) -> None:
-        """Return once both listen; a TimeoutError if it ends or never does."""
-        deadline = time.monotonic() + START_SECONDS
-        while time.monotonic() < deadline and self._process.poll() is None:
-            with (
-                contextlib.suppress(OSError),
-                socket.create_connection(self.page, 0.2),
-                socket.create_connection(self.stream, 0.2),
-            ):
-                return
-            time.sleep(0.02)
-        raise TimeoutError
+        stop_rerun(self._process)
 
 
 _LINUX = sys.platform == "linux"

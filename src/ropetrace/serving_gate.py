@@ -13,6 +13,7 @@ import hmac
 import http.client
 import io
 import ipaddress
+import re
 import secrets
 import socket
 import threading
@@ -21,10 +22,10 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from email.message import Message
 from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, quote, urlsplit
 
 from ropetrace.errors import ConfigError, OutputError
+from ropetrace.results.feed import Address
 
 READ_PATH = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
 """What the page asks for to be sent the pictures."""
@@ -41,13 +42,17 @@ hold what Rerun keeps for those who come late."""
 
 PIECE_BYTES = 1 << 16
 
+MOST_CONNECTIONS = 100
+"""More at once are turned away: a page takes some ten while it loads, and one to look on."""
+
+MOST_VIEWERS = 10
+"""More are turned away: `WAITING_BYTES` may wait for each."""
+
 CONTENT_POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; worker-src 'self' blob:; connect-src 'self' data: blob:; frame-ancestors 'none'"
 )
 """The page loads nothing from elsewhere, tells nothing to anybody else, and stands in no page of others."""
-
-Address = tuple[str, int]
 
 
 @dataclass(frozen=True)
@@ -82,12 +87,10 @@ class Request:
         return parse_qs(urlsplit(self.target).query)
 
     def cookie(self, name: str) -> str:
-        """The value of a cookie; empty if there is none."""
-        try:
-            morsel = SimpleCookie(self.headers.get("Cookie", "")).get(name)
-        except CookieError:
-            return ""
-        return "" if morsel is None else morsel.value
+        """The value of a cookie; empty if there is none. Those of other servers of this machine may be anything."""
+        cookies = "; ".join(self.headers.get_all("Cookie") or [])
+        found = re.search(rf"(?:^|;)\s*{re.escape(name)}=([^;]*)", cookies)
+        return found[1].strip() if found else ""
 
     def forwarded(self, host: str) -> bytes:
         """The head as it goes on to another server; the connection ends with the answer."""
@@ -125,12 +128,12 @@ class Gate:
     """
 
     def __init__(self, host: str, port: int) -> None:
-        self._socket = _listen(host, port)
-        bound = self._socket.getsockname()
-        self.port = int(bound[1])
+        self._socket = listen(host, port)
+        self.port = int(self._socket.getsockname()[1])
         self._host = host
-        self._own = ipaddress.ip_address(bound[0].partition("%")[0])
-        self.key = "" if self._own.is_loopback else secrets.token_urlsafe(16)
+        self.key = "" if is_loopback(self._socket) else secrets.token_urlsafe(16)
+        self._connections = 0
+        self._viewers = 0
         self._page: Address = ("", 0)
         self._stream: Address = ("", 0)
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -140,9 +143,7 @@ class Gate:
     @property
     def url(self) -> str:
         """What people open."""
-        name = socket.gethostname() if self._own.is_unspecified else self._host
-        name = f"[{name}]" if ":" in name else name
-        return f"http://{name}:{self.port}/" + (f"?key={self.key}" if self.key else "")
+        return f"http://{authority(self._socket, self._host)}/" + (f"?key={self.key}" if self.key else "")
 
     def open(self, page: Address, stream: Address) -> None:
         """Let browsers in, to Rerun's server of the page and its server of the pictures."""
@@ -170,21 +171,41 @@ class Gate:
 
     async def _meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer one request; a browser makes a connection for each."""
-        # Whoever goes away in the middle is no trouble; nor is the end of the gate.
-        with contextlib.suppress(OSError, asyncio.IncompleteReadError, TimeoutError, asyncio.CancelledError):
-            try:
-                async with asyncio.timeout(HEAD_SECONDS):
-                    request = Request.parse(await reader.readuntil(b"\r\n\r\n"))
-                answer = self.answer(request)
-            except (ValueError, asyncio.LimitOverrunError, http.client.HTTPException):
-                writer.write(_answer(HTTPStatus.BAD_REQUEST, "this is not a request of a browser"))
-            else:
-                if answer is None:
-                    await self._pass_on(request, reader, writer)
+        self._connections += 1
+        try:
+            # Whoever goes away in the middle is no trouble; nor is the end of the gate.
+            with contextlib.suppress(OSError, asyncio.IncompleteReadError, asyncio.CancelledError):
+                if self._connections > MOST_CONNECTIONS:
+                    writer.write(_answer(HTTPStatus.SERVICE_UNAVAILABLE, "too many connections"))
                 else:
-                    writer.write(answer)
-            await asyncio.wait_for(writer.drain(), STUCK_SECONDS)
-        writer.close()
+                    await self._serve(reader, writer)
+                await asyncio.wait_for(writer.drain(), STUCK_SECONDS)
+                writer.close()
+                await asyncio.wait_for(writer.wait_closed(), STUCK_SECONDS)
+        finally:
+            # What is closed alone waits for ever for whoever takes nothing.
+            writer.transport.abort()
+            self._connections -= 1
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            async with asyncio.timeout(HEAD_SECONDS):
+                request = Request.parse(await reader.readuntil(b"\r\n\r\n"))
+            answer = self.answer(request)
+        except (ValueError, asyncio.LimitOverrunError, http.client.HTTPException):
+            answer = _answer(HTTPStatus.BAD_REQUEST, "this is not a request of a browser")
+        if answer is not None:
+            writer.write(answer)
+        elif request.method != "POST":
+            await self._pass_on(request, self._page, reader, writer)
+        elif self._viewers >= MOST_VIEWERS:
+            writer.write(_answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWERS} viewers are looking on already"))
+        else:
+            self._viewers += 1
+            try:
+                await self._pass_on(request, self._stream, reader, writer)
+            finally:
+                self._viewers -= 1
 
     def answer(self, request: Request) -> bytes | None:
         """What a request is told by the gate itself: where to go, or why not; None if it may go on to Rerun.
@@ -193,7 +214,7 @@ class Gate:
         """
         origins = request.headers.get_all("Origin") or []
         name = urlsplit(f"//{request.host}").hostname
-        if not name or (not self.key and not self._is_own(name)):
+        if not name or (not self.key and not is_loopback_name(name)):
             return _answer(HTTPStatus.MISDIRECTED_REQUEST, f"{request.host!r} is no name of this machine's loopback")
         if any(origin != f"http://{request.host}" for origin in origins):
             return _answer(HTTPStatus.FORBIDDEN, f"the origin {origins[0]!r} is foreign")
@@ -207,23 +228,16 @@ class Gate:
             return _answer(HTTPStatus.METHOD_NOT_ALLOWED, "here one may only look")
         if request.path == "/" and "url" not in request.query:
             stream = quote(f"rerun+http://{request.host}/proxy", safe="")
-            keep = f"Set-Cookie: {cookie}={self.key}; Path=/; HttpOnly; SameSite=Strict\r\n" if self.key else ""
+            keep = f"Set-Cookie: {cookie}={self.key}; Path=/; HttpOnly; SameSite=Lax\r\n" if self.key else ""
             return _answer(
                 HTTPStatus.FOUND, "", f"Location: /?url={stream}&hide_welcome_screen&persist=false\r\n{keep}"
             )
         return None
 
-    def _is_own(self, name: str) -> bool:
-        """Whether a name can only mean this machine's loopback."""
-        try:
-            return ipaddress.ip_address(name).is_loopback
-        except ValueError:
-            return name == "localhost" or name.endswith(".localhost")
-
-    async def _pass_on(self, request: Request, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Carry bytes between the browser and Rerun until one of them ends."""
-        is_stream = request.method == "POST"
-        address = self._stream if is_stream else self._page
+    async def _pass_on(
+        self, request: Request, address: Address, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        """Carry bytes between the browser and Rerun until one of them ends; TimeoutError if one takes nothing."""
         try:
             from_rerun, to_rerun = await asyncio.open_connection(*address, limit=PIECE_BYTES)
         except OSError:
@@ -234,19 +248,21 @@ class Gate:
             # The page's requests have no body; that of the stream ends when the browser does.
             ways = [
                 asyncio.create_task(_carry(reader, to_rerun)),
-                asyncio.create_task(_bring(from_rerun, writer, is_stream)),
+                asyncio.create_task(_bring(from_rerun, writer, is_stream=request.method == "POST")),
             ]
             try:
                 await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
             finally:
                 for way in ways:
                     way.cancel()
-                await asyncio.gather(*ways, return_exceptions=True)
+                ends = await asyncio.gather(*ways, return_exceptions=True)
+            if any(isinstance(end, TimeoutError) for end in ends):
+                raise TimeoutError
         finally:
             to_rerun.close()
 
 
-async def _bring(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, is_stream: bool) -> None:
+async def _bring(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, is_stream: bool) -> None:
     """Carry an answer, with our headers added."""
     async with asyncio.timeout(HEAD_SECONDS):
         head = await reader.readuntil(b"\r\n\r\n")
@@ -321,8 +337,48 @@ def _answer(status: HTTPStatus, text: str, headers: str = "") -> bytes:
     ).encode() + body
 
 
-def _listen(host: str, port: int) -> socket.socket:
-    """A socket that listens at an address of this machine."""
+def is_loopback_name(name: str) -> bool:
+    """Whether a name can only mean this machine's loopback; a foreign page can make any other point here."""
+    try:
+        return ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return name == "localhost" or name.endswith(".localhost")
+
+
+def _address_of(listening: socket.socket) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    return ipaddress.ip_address(listening.getsockname()[0].partition("%")[0])
+
+
+def is_loopback(listening: socket.socket) -> bool:
+    """Whether a socket takes connections from this machine alone."""
+    return _address_of(listening).is_loopback
+
+
+def authority(listening: socket.socket, host: str) -> str:
+    """What people call the place of a socket that listens on `host`: a name and the port."""
+    name = socket.gethostname() if _address_of(listening).is_unspecified else host
+    return f"{f'[{name}]' if ':' in name else name}:{listening.getsockname()[1]}"
+
+
+def listen(host: str, port: int, option: str = "--host") -> socket.socket:
+    """A socket that listens at an address of this machine, or at all of them: 0.0.0.0 for IPv4, :: for both.
+
+    Parameters
+    ----------
+    host : str
+        The address, or its name.
+    port : int
+        0: any that is free.
+    option : str
+        What the user gives the address by.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such address.
+    OutputError
+        If the port is taken.
+    """
     if not 0 <= port <= 65535:
         raise ConfigError(f"--port {port}: expected 0 to 65535")
     try:
@@ -330,11 +386,12 @@ def _listen(host: str, port: int) -> socket.socket:
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE if host else 0
         )[0]
     except (OSError, UnicodeError) as error:
-        raise ConfigError(f"--host {host}: there is no such address ({error}): give one of this machine's") from None
+        raise ConfigError(f"{option} {host}: there is no such address ({error}): give one of this machine's") from None
+    both = family == socket.AF_INET6 and address[0] == "::" and socket.has_dualstack_ipv6()
     try:
-        return socket.create_server(address[:2], family=family)
+        return socket.create_server(address[:2], family=family, dualstack_ipv6=both)
     except OSError as error:
         what = f"{host}:{port}: cannot be listened on: {error.strerror or error}"
         if error.errno == errno.EADDRINUSE:
             raise OutputError(f"{what}: end what runs there, or give another --port (0: any that is free)") from None
-        raise ConfigError(f"{what}: give an address of this machine to --host") from None
+        raise ConfigError(f"{what}: give an address of this machine to {option}") from None

@@ -9,12 +9,12 @@ from typing import Literal
 import numpy as np
 
 from ropetrace.config import RopeConfig
-from ropetrace.errors import ConfigError
+from ropetrace.errors import ConfigError, FrameError
 from ropetrace.proposal import propose_diameter
 from ropetrace.things import depth_in_metres
 from ropetrace.trackers.slicing import A_SURFACE, SlicingTracker
 from ropetrace.tuning import Look
-from ropetrace.types import BadFrame, CloudFrame, Frame, RgbdFrame, Status
+from ropetrace.types import BadFrame, CloudFrame, Frame, RgbdFrame, Status, lacks_color
 
 _OTHER = 1.5
 """A diameter that is wrong by more than this factor is told of."""
@@ -37,9 +37,11 @@ _REMEDIES = (
     ("too few points", "raise the colour tolerance, or click on the rope again"),
     ("do not hang together", "raise the colour tolerance, or click on the rope again"),
     ("is bridged", "if parts of the rope are not green, raise the colour tolerance"),
+    ("too short for a rope", "if parts of the rope are not green, click on it again; else press 'measure'"),
     ("curve turns back sharply", _CLOSE_STRANDS),
     ("strands overlap", _CLOSE_STRANDS),
     ("of the rope is hidden", _HIDDEN),
+    (" m lately: a part is hidden", _HIDDEN),
     ("is the recording in millimetres", "give the depth its true unit in the recording"),
 )
 """Words of a reason, and what to do about it; what is to be mended first comes first."""
@@ -114,7 +116,7 @@ def _another_thickness(look: Look) -> str | None:
         return None
     try:
         seen = propose_diameter([look.event], look.config.color).diameter
-    except ConfigError:
+    except (ConfigError, FrameError):
         return None
     if 1 / _OTHER < look.config.diameter / seen < _OTHER:
         return None
@@ -127,6 +129,11 @@ def _another_thickness(look: Look) -> str | None:
 def _why_nothing_passes(config: RopeConfig, frame: Frame) -> str:
     if not _count_with_depth(frame):
         return "Nothing in this frame has depth: the camera is covered, too near, or looks at glass or into the sun."
+    if config.asks_for_color and lacks_color(frame):
+        return (
+            "This frame has no colour, and the settings ask for one. Switch the colour of the camera on; or end this, "
+            "and begin without a colour."
+        )
     low, high = config.segmentation.box_min, config.segmentation.box_max
     if low is not None and high is not None:
         no_box = dataclasses.replace(config.segmentation, box_min=None, box_max=None)

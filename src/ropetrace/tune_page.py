@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import hmac
-import ipaddress
 import json
 import os
 import secrets
-import socket
 import sys
 import threading
 import time
@@ -24,20 +22,25 @@ from urllib.parse import parse_qs, urlsplit
 
 from ropetrace.errors import ConfigError, OutputError, RopetraceError, import_extra
 from ropetrace.recordings.base import printable
+from ropetrace.serving_gate import authority, is_loopback, is_loopback_name, listen
 from ropetrace.tune_message import message_of
 from ropetrace.tuning import Look, Tuning
+from ropetrace.types import BadFrame
 
 _MOST_BYTES = 65_536
 """The longest message that is taken from a browser."""
 
-_ANY = ("", "0.0.0.0", "::")
-"""Addresses that stand for all of this machine's."""
+_MOST_BROWSERS = 20
+"""More at once are turned away."""
 
 _HANDSHAKE = 2.0
 """Browsers open connections in advance; one that asks for nothing is closed after this, seconds."""
 
 _FAREWELL = 2.0
 """How long a browser may take to close its connection, seconds."""
+
+_STUCK = 10.0
+"""A browser that has not taken a message after this long is cut off, seconds."""
 
 _SHORTEST_STEP = 1 / 15
 """Between two frames that are sent to one browser, seconds."""
@@ -54,6 +57,9 @@ _GLANCE_SECONDS = 0.25
 _LONGEST_END = 5.0
 """How long the frame that is looked at may take to the end, seconds; the compiler is not waited for."""
 
+_INTERNAL_ERROR = 1011
+"""The code with which a WebSocket is closed for a fault of ours."""
+
 _HEADERS = {
     "Content-Type": "text/html; charset=utf-8",
     "Content-Security-Policy": (
@@ -67,31 +73,24 @@ _HEADERS = {
 }
 
 
-def refusal(host: str, origin: str | None, token: str, given: str) -> str | None:
+def refusal(host: str, origin: str | None, token: str, given: str, *, on_loopback: bool) -> str | None:
     """Why a request is refused, or None.
 
-    A foreign page that is open in the same browser can send requests here, but not without an `origin` of its own; nor
-    can one whose name is made to point here, for its `host` is a name, and not this machine's.
+    A foreign page that is open in the same browser can send requests here, but not without an `origin` of its own; nor,
+    on loopback, can one whose name is made to point here, for its `host` is not a name of loopback. Further out a
+    machine may have any name, and the token alone decides.
     """
     try:
         name = urlsplit(f"//{host}").hostname or ""
     except ValueError:
         name = ""
-    if not (name in ("localhost", socket.gethostname().lower()) or _is_address(name)):
-        return f"the host {host!r} is not this machine"
+    if not name or (on_loopback and not is_loopback_name(name)):
+        return f"the host {host!r} is no name of this machine's loopback" if on_loopback else f"{host!r} is no host"
     if origin is not None and origin != f"http://{host}":
         return f"the origin {origin!r} is foreign"
     if not hmac.compare_digest(token.encode(), given.encode()):
         return "the token is missing or wrong"
     return None
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
 
 
 @dataclass(eq=False)
@@ -188,13 +187,19 @@ class TunePage:
     ----------
     tuning : Tuning, optional
         None as long as the source is not open.
+    url : str
+        The address to open, with its token.
+    open_to_others : bool
+        Whether other machines may get in.
 
     Raises
     ------
     MissingExtraError
         If websockets is not installed.
+    ConfigError
+        If there is no such address.
     OutputError
-        If the address cannot be listened on.
+        If the port is taken.
 
     Notes
     -----
@@ -225,29 +230,21 @@ class TunePage:
         self._stopping = False
         self._encoding = threading.Lock()
         self._encoded = (0, "")
-        try:
-            self._server = serve(
-                self._talk,
-                self.bind,
-                self.port,
-                process_request=self._answer,
-                open_timeout=_HANDSHAKE,
-                close_timeout=_FAREWELL,
-                max_size=_MOST_BYTES,
-                compression=None,
-                server_header=None,
-            )
-        except (OSError, OverflowError) as error:
-            raise OutputError(f"{self.bind}:{self.port}: cannot be listened on: {error}") from None
-        self.port = self._server.socket.getsockname()[1]
+        listening = listen(self.bind, self.port, "--bind")
+        self.port = listening.getsockname()[1]
+        self.open_to_others = not is_loopback(listening)
+        self.url = f"http://{authority(listening, self.bind)}/?token={self.token}"
+        self._server = serve(
+            self._talk,
+            sock=listening,
+            process_request=self._answer,
+            open_timeout=_HANDSHAKE,
+            close_timeout=_FAREWELL,
+            max_size=_MOST_BYTES,
+            compression=None,
+            server_header=None,
+        )
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
-
-    @property
-    def url(self) -> str:
-        """The address to open, with its token."""
-        host = socket.gethostname() if self.bind in _ANY else self.bind
-        host = f"[{host}]" if ":" in host else host
-        return f"http://{host}:{self.port}/?token={self.token}"
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -377,6 +374,8 @@ class TunePage:
 
     def _talk(self, connection: Any) -> None:
         """What a browser asks for, one thing after the other."""
+        # A browser that is gone without a word must hold up neither its sender nor the end.
+        connection.socket.settimeout(_STUCK)
         seat = _Seat()
         sender = threading.Thread(target=self._send_newest, args=(connection, seat), daemon=True)
         sender.start()
@@ -391,21 +390,30 @@ class TunePage:
             sender.join()
 
     def _send_newest(self, connection: Any, seat: _Seat) -> None:
+        try:
+            with suppress(self._closed):
+                self._send_all(connection, seat)
+        except Exception as error:
+            # Without what sends, the page would stand still without a word.
+            print(f"closed    a page: {type(error).__name__}: {printable(str(error))}", file=sys.stderr)
+            connection.close(_INTERNAL_ERROR)
+
+    def _send_all(self, connection: Any, seat: _Seat) -> None:
+        """Send what is newest, whenever the browser has shown what was sent before, until the browser goes."""
         when = 0.0
-        with suppress(self._closed):
-            while True:
-                with self._news:
-                    self._news.wait_for(lambda: not seat.is_open or (seat.is_ready and self._version > seat.version))
-                    if not seat.is_open:
-                        return
-                    seat.is_ready = False
-                time.sleep(max(when + _SHORTEST_STEP - time.monotonic(), 0.0))
-                seat.version, shown, text = self._text_of_newest()
-                when = time.monotonic()
-                if shown.look is not None:
-                    seat.sent.append(shown.look)
-                done = seat.serial if shown.change >= seat.change else 0
-                connection.send(f'{{"done": {done}, "state": {text}}}')
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: not seat.is_open or (seat.is_ready and self._version > seat.version))
+                if not seat.is_open:
+                    return
+                seat.is_ready = False
+            time.sleep(max(when + _SHORTEST_STEP - time.monotonic(), 0.0))
+            seat.version, shown, text = self._text_of_newest()
+            when = time.monotonic()
+            if shown.look is not None:
+                seat.sent.append(shown.look)
+            done = seat.serial if shown.change >= seat.change else 0
+            connection.send(f'{{"done": {done}, "state": {text}}}')
 
     def _take(self, seat: _Seat, text: str | bytes) -> None:
         """Do what a message asks for, and look again."""
@@ -432,9 +440,10 @@ class TunePage:
             self._said, self._trouble, self._asks_to_replace = said, trouble, asks
             self._change += 1
             seat.change, seat.serial = self._change, serial
-            if self._shown.busy and self.tuning is not None:
-                # Whoever clicks while the kernels compile sees at once what was found.
-                self._show(replace(self._shown, change=self._change, look=self.tuning.glance()))
+            tuning = self.tuning
+            if tuning is not None and (self._shown.busy or isinstance(tuning.event, BadFrame)):
+                # Whoever clicks while the kernels compile, or a camera is waited for, sees at once what was found.
+                self._show(replace(self._shown, change=self._change, look=tuning.glance()))
             self._news.notify_all()
 
     def _do(self, asked: Mapping[str, Any], seat: _Seat) -> list[str]:
@@ -444,7 +453,7 @@ class TunePage:
             raise ConfigError("the source is not open yet")
         match asked["do"]:
             case "click":
-                event = next((sent.event for sent in seat.sent if sent.index == asked["index"]), None)
+                event = next((sent.event for sent in tuple(seat.sent) if sent.index == asked["index"]), None)
                 return tuning.click(int(asked["column"]), int(asked["row"]), event)
             case "measure":
                 return tuning.measure()
@@ -474,17 +483,23 @@ class TunePage:
 
     def _answer(self, connection: Any, request: Any) -> Any:
         """The page, a refusal, or None to go on to the WebSocket."""
-        address = urlsplit(request.path)
+        try:
+            address = urlsplit(request.path)
+        except ValueError:
+            return connection.respond(HTTPStatus.BAD_REQUEST, "this is no address\n")
         given = parse_qs(address.query).get("token", [""])[0]
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         opens_socket = address.path == "/socket"
-        why = refusal(hosts[0] if len(hosts) == 1 else "", origins[0] if origins else None, self.token, given)
+        host, origin = hosts[0] if len(hosts) == 1 else "", origins[0] if origins else None
+        why = refusal(host, origin, self.token, given, on_loopback=not self.open_to_others)
         if why is None and opens_socket and not origins:
             why = "a browser tells its origin"
         if why is not None:
             print(f"refused   {connection.remote_address[0]}: {printable(why)}", file=sys.stderr)
             return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
         if opens_socket:
+            if len(self._server.connections) >= _MOST_BROWSERS:
+                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many pages are open\n")
             return None
         if address.path != "/":
             return connection.respond(HTTPStatus.NOT_FOUND, "there is one page here: /\n")

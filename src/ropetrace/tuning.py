@@ -17,6 +17,7 @@ from ropetrace.live import LiveRecording
 from ropetrace.picture import backdrop, pixels_of
 from ropetrace.proposal import propose_color_at, propose_diameter
 from ropetrace.recordings import Recording
+from ropetrace.recordings.base import has_color
 from ropetrace.trackers import Tracker, make_tracker
 from ropetrace.trackers.slicing import SlicingTracker
 from ropetrace.tracking import estimates_of
@@ -32,6 +33,8 @@ from ropetrace.types import (
     lacks_color,
     moved,
 )
+
+NO_COLOR = "a colour is asked for, but the recording has none: leave out the colour, or record it"
 
 UNKNOWN_DIAMETER = 0.012
 """What is begun with where no diameter is given, metres: the first click measures it."""
@@ -135,7 +138,7 @@ class Tuning:
     ------
     ConfigError
         If the colour is that of a pixel of the first frame: it would be another in each frame that is looked at. If a
-        live source is limited.
+        colour is asked for, and the first frames have none. If a live source is limited.
     RecordingError
         If there is no frame.
     """
@@ -162,6 +165,15 @@ class Tuning:
             self._shown: tuple[int, Event] = (0, self._newest())
         elif not self.go_to(start):
             raise RecordingError(f"{recording.path}: there is no frame {start}")
+        if self.config.asks_for_color and not self._has_color():
+            self.close()
+            raise ConfigError(NO_COLOR)
+
+    def _has_color(self) -> bool:
+        """Whether the first frames have colour; a live source is not begun anew to find out."""
+        if self._live is not None:
+            return isinstance(self.event, BadFrame) or not lacks_color(self.event)
+        return has_color(self._recording, self.first)
 
     @property
     def name(self) -> str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from ropetrace.errors import import_extra
+from ropetrace.results import NO_METADATA
 from ropetrace.results.base import rope_name
 from ropetrace.types import Cloud, CloudFrame, Estimate, FloatArray, Frame, RgbdFrame, Status
 from ropetrace.viewer_shapes import (
@@ -24,7 +24,7 @@ from ropetrace.viewer_shapes import (
     velocity_picture,
 )
 
-__all__ = ["NO_METADATA", "ArmView", "RerunLog", "default_blueprint", "new_recording", "rope_entity"]
+__all__ = ["ArmView", "RerunLog", "default_blueprint", "new_recording", "rope_entity"]
 
 rr: Any = import_extra("rerun", "viewer")
 rrb: Any = import_extra("rerun.blueprint", "viewer")
@@ -41,9 +41,6 @@ CLOUD_POINTS = 3_000
 STATUS_LEVELS = {Status.OK: "INFO", Status.DEGRADED: "WARN", Status.LOST: "ERROR"}
 
 NO_NODE_COLOR = (110, 110, 110)
-
-NO_METADATA: Mapping[str, str] = MappingProxyType({})
-
 
 LIVE_PICTURES = 15.0
 """A live log has at most this many pictures a second, by the stamps; each costs a browser memory and time."""
@@ -129,8 +126,9 @@ class RerunLog:
     metadata : mapping of str to str
         Shown as texts under ``/metadata``.
     live : bool
-        Log for people who look on, who come late, and must not be flooded: every estimate is in the plots, but there
-        are at most `LIVE_PICTURES` a second, and whoever missed the beginning misses nothing that matters.
+        Log for people who look on, who come late, and must not be flooded: every estimate that is logged is in the
+        plots, but there are at most `LIVE_PICTURES` a second, and whoever missed the beginning misses nothing that
+        matters.
     """
 
     def __init__(

@@ -26,6 +26,7 @@ FORMATS = MappingProxyType(
 """The endings that `open_writer` takes, each with the class that writes it."""
 
 NO_METADATA: Mapping[str, str] = MappingProxyType({})
+"""What is kept beside the results where nothing is given."""
 
 
 def check_outputs(paths: Sequence[Path], overwrite: bool, inputs: Sequence[Path] = ()) -> None:

@@ -87,6 +87,9 @@ _FREE = 0.2
 _ODD = 4.0
 """A strand that belongs to no rope is worth telling if it is longer than this, diameters."""
 
+MOST_ROPES = 32
+"""Where all ropes that are seen are looked for, no more than this are taken up: none is ever given up again."""
+
 _NEW_ROPE = 10.0
 """A strand that belongs to no rope must be this long to be another, diameters."""
 
@@ -203,7 +206,7 @@ class PersistentTracker:
         if path is None or not pieces:
             few = too_little(view.points.shape[1], 0 if path is None else len(path.slices))
             return self._all_lost(view.frame.stamp_ns, few, view.count)
-        wanted = len(pieces) if self.config.ropes == "auto" else self.config.ropes
+        wanted = MOST_ROPES if self.config.ropes == "auto" else self.config.ropes
         left_out = len(path.slices) - sum(len(run) for piece in pieces[:wanted] for run in piece)
         if left_out:
             view.reasons.append(
@@ -283,7 +286,7 @@ class PersistentTracker:
         self._astray = self._astray + elapsed if odd_length > length else 0.0
         if odd_length > _ODD * diameter:
             view.reasons.append(f"{odd_length:.2f} m of something else of that colour is left out")
-        self._add_rope(odd, elapsed)
+        self._add_rope(odd, elapsed, view)
         laid = []
         for number, (rope, there) in enumerate(zip(self._ropes, expected, strict=False)):
             its = laid_along([one for one in placed if one.rope == number], there, diameter)
@@ -338,13 +341,17 @@ class PersistentTracker:
             strand = view.strands[0]
         return strand if all(strand.clear) else None
 
-    def _add_rope(self, odd: list[Strand], elapsed: float) -> None:
+    def _add_rope(self, odd: list[Strand], elapsed: float, view: _View) -> None:
         """Another rope, if one is still looked for and a strand has belonged to none for a while."""
-        wanted = self.config.ropes
+        wanted = MOST_ROPES if self.config.ropes == "auto" else self.config.ropes
         longest = max(odd, key=lambda strand: strand.length, default=None)
         is_new = longest is not None and longest.length > _NEW_ROPE * self.config.diameter
         self._odd_for = self._odd_for + elapsed if is_new else 0.0
-        if longest is None or self._odd_for <= _ASTRAY_AFTER or (wanted != "auto" and len(self._ropes) >= wanted):
+        if longest is None or self._odd_for <= _ASTRAY_AFTER:
+            return
+        if len(self._ropes) >= wanted:
+            if self.config.ropes == "auto":
+                view.reasons.append(f"{MOST_ROPES} ropes are followed already: no more are taken up")
             return
         self._odd_for = 0.0
         self._ropes.append(self._begun([longest], []))
