@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import os
 import socket
+import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
+from ropetrace.recordings.ros_frames import frame_messages
+from ropetrace.results.ros_estimates import typestore
+from ropetrace.ros.graph import RosNode, Subscription
 from ropetrace.ros.zenoh_session import Connection, open_router
+from ropetrace.types import Frame
 
 
 def free_port() -> int:
@@ -32,6 +39,80 @@ def routed() -> Iterator[Connection]:
         yield Connection(router=endpoint)
     finally:
         router.close()
+
+
+@contextmanager
+def publishing(join: Callable[[], RosNode], frame: Callable[[], Frame], under: str = "") -> Iterator[None]:
+    """A camera of its own node that publishes frames, 50 a second, under a prefix of the usual topics."""
+    stop = threading.Event()
+
+    def run() -> None:
+        with join() as node:
+            made: dict[str, Any] = {}
+            while not stop.wait(0.02):
+                for message in frame_messages(frame()):
+                    if message.topic not in made:
+                        made[message.topic] = node.publisher(under + message.topic, message.type)
+                    made[message.topic].put_packed(bytes(message.data))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+class LocalPublisher:
+    """Hands its messages to the subscriptions of its node."""
+
+    def __init__(self, node: LocalNode, topic: str, type_name: str) -> None:
+        self._node, self._topic, self._type = node, topic, type_name
+
+    def put(self, message: Any) -> None:
+        self.put_packed(bytes(typestore().serialize_cdr(message, self._type)))
+
+    def put_packed(self, data: bytes) -> None:
+        for read in self._node.reads[self._topic]:
+            if read.type == self._type:
+                read.receive(data, "cdr")
+
+
+class LocalNode:
+    """A node without a graph: who publishes by it is heard by who reads by it, at once."""
+
+    name = "local"
+
+    def __init__(self) -> None:
+        self.reads: defaultdict[str, list[Subscription]] = defaultdict(list)
+        self._arrived = threading.Event()
+
+    def __enter__(self) -> LocalNode:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def publisher(self, topic: str, type_name: str, depth: int = 5) -> LocalPublisher:
+        return LocalPublisher(self, topic, type_name)
+
+    def subscription(self, topic: str, type_name: str, depth: int = 1) -> Subscription:
+        self.reads[topic].append(Subscription(topic, type_name, depth, self._arrived))
+        return self.reads[topic][-1]
+
+    def wait(self, seconds: float) -> None:
+        self._arrived.wait(seconds)
+        self._arrived.clear()
+
+    def show(self, frame: Frame, *left_out: str) -> None:
+        """Publish a frame but for some topics."""
+        for message in frame_messages(frame):
+            if message.topic not in left_out:
+                self.publisher(message.topic, message.type).put_packed(bytes(message.data))
 
 
 def until(condition: Callable[[], object], seconds: float = 20.0) -> None:

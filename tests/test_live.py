@@ -75,6 +75,13 @@ def live(camera: Camera, silence: float = 0.1, give_up: float = 1.0) -> LiveReco
     return LiveRecording("test:", camera, silence=silence, give_up=give_up)
 
 
+def wait_for(condition: Callable[[], object]) -> None:
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.001)
+
+
 def cameras_running() -> int:
     return sum(thread.name == "camera" for thread in threading.enumerate())
 
@@ -123,12 +130,15 @@ def test_a_second_reader_ends_the_first() -> None:
 def test_a_slow_reader_gets_the_newest_and_the_others_are_counted() -> None:
     camera = ScriptedCamera(steady, period=0.002)
     recording = live(camera)
-    taken = []
+    taken: list[int] = []
+    newest = 0
     for event in recording.frames(limit=8):
         taken.append(round(event.stamp_ns / SECOND / PERIOD))
-        newest = camera.fetched - 1
-        time.sleep(0.03)
-        assert newest - taken[-1] <= 2, "the newest frame wins"
+        assert taken[-1] >= newest, "the newest frame wins"
+        enough = camera.fetched + 8
+        wait_for(lambda enough=enough: camera.fetched >= enough)  # type: ignore[misc]
+        # The last one may be on its way, but not the one before it.
+        newest = camera.fetched - 2
     assert recording.dropped >= 7 * 5
     assert recording.dropped == taken[-1] + 1 - len(taken), "every frame was taken or is counted"
     assert 0 < recording.dropped_at_start < recording.dropped
@@ -148,6 +158,43 @@ def test_whoever_wants_all_frames_is_given_them() -> None:
     assert [event.stamp_ns for event in given] == [steady(index).stamp_ns for index in range(len(given))]
     assert len(given) > 20
     assert all(any(event is other for other in given) for event in taken)
+
+
+def test_a_camera_that_hangs_hands_on_nothing_after_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_stream, "CLOSE_SECONDS", 0.05)
+    going_on = threading.Event()
+    given: list[Event] = []
+
+    def script(index: int) -> Event:
+        if index == 3:
+            going_on.wait(30)
+        return steady(index)
+
+    camera = ScriptedCamera(script)
+    recording = live(camera)
+    recording.on_event = given.append
+    frames = recording.frames()
+    next(frames)
+    wait_for(lambda: camera.fetched == 4)
+    recording.close()
+    known = len(given)
+    going_on.set()
+    wait_for(lambda: camera.disconnected == 1)
+    assert len(given) == known
+    assert any("hangs and did not stop" in problem for problem in recording.problems)
+
+
+def test_times_without_frames_are_told_one_by_one_and_then_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ropetrace.live.recording.MOST_GAPS", 2)
+    recording = live(ScriptedCamera(lambda index: steady(index) if index % 8 == 0 else None), silence=0.03)
+    frames = recording.frames()
+    wait_for(lambda: isinstance(next(frames), RgbdFrame) and len(recording.problems) == 3)
+    told = recording.problems[2]
+    wait_for(lambda: isinstance(next(frames), RgbdFrame) and recording.problems[2] != told)
+    recording.close()
+    assert len(recording.problems) == 3
+    assert all("gave no frame for" in problem for problem in recording.problems[:2])
+    assert re.fullmatch(r"and \d+ more times without frames", recording.problems[2])
 
 
 def test_a_fault_of_whoever_wants_all_frames_is_told() -> None:
@@ -192,7 +239,7 @@ def test_a_camera_that_falls_silent_is_started_anew(monkeypatch: pytest.MonkeyPa
     camera = ScriptedCamera(lambda index: None if 5 <= index < 40 else steady(index))
     events = list(live(camera).frames(limit=20))
     assert camera.connected >= 2
-    assert any(isinstance(event, BadFrame) and "plugged in" in event.reason for event in events)
+    assert any(isinstance(event, BadFrame) and "is it still connected" in event.reason for event in events)
     assert isinstance(events[-1], RgbdFrame)
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +18,19 @@ import pytest
 pytest.importorskip("zenoh")
 pytest.importorskip("xxhash")
 
+import ros_rig
 from ropetrace.errors import ConfigError, MissingExtraError, RecordingError, RopetraceError
 from ropetrace.live import LiveRecording, ros_camera
+from ropetrace.live.ros_camera import open_ros
 from ropetrace.recordings import open_recording
-from ropetrace.recordings.ros_frames import CLOUD_TOPIC, COLOR_TOPIC, DEPTH_TOPIC, frame_messages
+from ropetrace.recordings.ros_frames import CLOUD_TOPIC, COLOR_TOPIC, DEPTH_TOPIC
 from ropetrace.recordings.ros_messages import CAMERA, IMAGE
 from ropetrace.ros import live_camera
-from ropetrace.ros.graph import Subscription
 from ropetrace.ros.live_camera import CameraTopics, LiveCamera, camera_info_beside
 from ropetrace.ros.zenoh_graph import ZenohNode
 from ropetrace.ros.zenoh_session import Connection
 from ropetrace.types import BadFrame, CloudFrame, Event, Frame, Intrinsics, RgbdFrame
-from ros_rig import free_endpoint, routed, until
+from ros_rig import LocalNode, free_endpoint, routed, until
 
 LENS = Intrinsics(4, 3, 5.0, 6.0, 1.5, 1.0)
 DEPTH = np.arange(12, dtype=np.uint16).reshape(3, 4) + 1000
@@ -49,27 +50,9 @@ def cloud() -> CloudFrame:
     return CloudFrame(time.time_ns(), POINTS)
 
 
-@contextmanager
-def publishing(connection: Connection, frame: Any, under: str = "") -> Iterator[None]:
-    """A camera of its own node that publishes frames, 50 a second, under a prefix of the usual topics."""
-    stop = threading.Event()
-
-    def run() -> None:
-        with ZenohNode("camera", connection) as node:
-            made: dict[str, Any] = {}
-            while not stop.wait(0.02):
-                for message in frame_messages(frame()):
-                    if message.topic not in made:
-                        made[message.topic] = node.publisher(under + message.topic, message.type)
-                    made[message.topic].put_packed(bytes(message.data))
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+def publishing(connection: Connection, frame: Callable[[], Frame], under: str = "") -> AbstractContextManager[None]:
+    """A camera on the graph."""
+    return ros_rig.publishing(lambda: ZenohNode("camera", connection), frame, under)
 
 
 def opened(connection: Connection, **topics: str) -> LiveRecording:
@@ -223,29 +206,12 @@ def test_ros1_without_rospy_is_one_error(monkeypatch: pytest.MonkeyPatch) -> Non
         open_recording("ros1:")
 
 
-class Topics:
-    """A node whose messages a test writes."""
-
-    name = "topics"
-
-    def __init__(self) -> None:
-        self.read: dict[str, Subscription] = {}
-
-    def subscription(self, topic: str, type_name: str, depth: int = 1) -> Subscription:
-        return self.read.setdefault(topic, Subscription(topic, type_name, depth, threading.Event()))
-
-    def send(self, frame: Frame, *left_out: str) -> None:
-        for message in frame_messages(frame):
-            if message.topic in self.read and message.topic not in left_out:
-                self.read[message.topic].receive(bytes(message.data), "cdr")
-
-
-def seen_for(camera: LiveCamera, topics: Topics, *left_out: str, seconds: float = 0.5) -> list[Event]:
+def seen_for(camera: LiveCamera, node: LocalNode, *left_out: str, seconds: float = 0.5) -> list[Event]:
     """What a camera of 100 frames a second gives: three frames at least."""
     found: list[Event] = []
     end = time.monotonic() + seconds
     while time.monotonic() < end or len(found) < 3:
-        topics.send(rgbd(), *left_out)
+        node.show(rgbd(), *left_out)
         seen = camera.take()
         if seen is not None:
             found.append(seen.event)
@@ -254,26 +220,135 @@ def seen_for(camera: LiveCamera, topics: Topics, *left_out: str, seconds: float 
 
 
 def test_a_fast_camera_without_its_partners_is_told_and_not_silent() -> None:
-    topics = Topics()
-    camera = LiveCamera(topics, CameraTopics(), wants_color=True)  # type: ignore[arg-type]
+    node = LocalNode()
+    camera = LiveCamera(node, CameraTopics(), wants_color=True)
     info = camera_info_beside(DEPTH_TOPIC)
-    reasons = {getattr(event, "reason", "") for event in seen_for(camera, topics, info)}
+    reasons = {getattr(event, "reason", "") for event in seen_for(camera, node, info)}
     assert reasons == {f"{DEPTH_TOPIC}: no camera_info yet on {info}"}
-    reasons = {getattr(event, "reason", "") for event in seen_for(camera, topics, COLOR_TOPIC)}
+    reasons = {getattr(event, "reason", "") for event in seen_for(camera, node, COLOR_TOPIC)}
     assert any("no colour image within 20 ms" in reason for reason in reasons)
-    assert isinstance(seen_for(camera, topics)[-1], RgbdFrame)
+    assert isinstance(seen_for(camera, node)[-1], RgbdFrame)
 
 
 def test_colour_that_came_once_is_waited_for() -> None:
-    topics = Topics()
-    camera = LiveCamera(topics, CameraTopics(), wants_color=True, may_lack_color=True)  # type: ignore[arg-type]
-    without = seen_for(camera, topics, COLOR_TOPIC)
+    node = LocalNode()
+    camera = LiveCamera(node, CameraTopics(), wants_color=True, may_lack_color=True)
+    without = seen_for(camera, node, COLOR_TOPIC)
     assert {type(event) for event in without} == {RgbdFrame}
     assert all(event.color is None for event in without if isinstance(event, RgbdFrame))
-    complete = seen_for(camera, topics, seconds=0.2)
+    complete = seen_for(camera, node, seconds=0.2)
     assert isinstance(complete[-1], RgbdFrame)
     assert complete[-1].color is not None
-    assert isinstance(seen_for(camera, topics, COLOR_TOPIC)[-1], BadFrame)
+    assert isinstance(seen_for(camera, node, COLOR_TOPIC)[-1], BadFrame)
+
+
+def shown(number: int) -> RgbdFrame:
+    """A frame of 60 a second whose pixels tell its number in depth and in colour."""
+    depth, color = np.full((3, 4), 1000 + number, np.uint16), np.full((3, 4, 3), number, np.uint8)
+    return RgbdFrame(1_700_000_000 * 10**9 + number * 16_000_000, depth, 0.001, LENS, color)
+
+
+@pytest.mark.parametrize("in_order", [False, True])
+def test_colour_is_that_of_the_depth_image_and_not_of_the_one_before(in_order: bool) -> None:
+    """Depth comes first, and once a depth image is lost: what is nearest by then is 16 ms away, and near enough."""
+    node = LocalNode()
+    camera = LiveCamera(node, CameraTopics(), wants_color=True, in_order=in_order)
+    pairs = []
+    for number in range(12):
+        for left_out in ({COLOR_TOPIC}, {DEPTH_TOPIC}):
+            node.show(shown(number), *left_out, *([DEPTH_TOPIC] if number == 4 else []))
+            seen = camera.take()
+            if seen is not None:
+                assert isinstance(seen.event, RgbdFrame)
+                assert seen.event.color is not None
+                pairs.append((int(seen.event.depth[0, 0]) - 1000, int(seen.event.color[0, 0, 0])))
+    assert pairs == [(number, number) for number in range(12) if number != 4]
+
+
+def test_colour_that_is_not_the_nearest_serves_where_no_other_comes() -> None:
+    node = LocalNode()
+    camera = LiveCamera(node, CameraTopics(), wants_color=True)
+    node.show(shown(0), DEPTH_TOPIC)
+    node.show(shown(1), COLOR_TOPIC)
+    assert camera.take() is None
+    got: list[Event] = []
+
+    def came() -> bool:
+        seen = camera.take()
+        got.extend([] if seen is None else [seen.event])
+        return bool(got)
+
+    until(came)
+    assert isinstance(got[0], RgbdFrame)
+
+
+def test_what_nobody_takes_in_order_is_counted_and_not_kept() -> None:
+    node = LocalNode()
+    camera = LiveCamera(node, CameraTopics(cloud=CLOUD_TOPIC), wants_color=False, in_order=True)
+    for _ in range(3):
+        for _ in range(4):
+            node.show(cloud())
+        camera.take()
+    taken = 3
+    while camera.take() is not None:
+        taken += 1
+    assert taken + camera.skipped == 12
+    assert camera.skipped >= 5
+    # What makes room before it is looked at counts, too.
+    for _ in range(10):
+        node.show(cloud())
+    while camera.take() is not None:
+        taken += 1
+    assert taken + camera.skipped == 22
+
+
+def test_images_in_order_do_not_stay_behind() -> None:
+    node = LocalNode()
+    camera = LiveCamera(node, CameraTopics(), wants_color=True, in_order=True)
+    taken = []
+    for number in range(60):
+        node.show(shown(number))
+        if number % 2:  # two come while one is worked on
+            seen = camera.take()
+            assert seen is not None
+            assert isinstance(seen.event, RgbdFrame)
+            taken.append(int(seen.event.depth[0, 0]) - 1000)
+            assert number - taken[-1] <= 8
+    assert taken == sorted(taken)
+    while camera.take() is not None:
+        taken.append(0)
+    assert len(taken) + camera.skipped == 60
+
+
+def test_images_that_wait_have_bounded_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_camera, "BUFFERED_BYTES", 1000)
+    node = LocalNode()
+    camera = LiveCamera(node, CameraTopics(), wants_color=True, in_order=True)
+    for number in range(20):
+        node.show(shown(number), COLOR_TOPIC)
+        assert camera.take() is None
+    assert 1 <= camera.waiting < 12
+    assert camera.waiting + camera.skipped == 20
+
+
+def test_what_a_live_source_loses_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = LocalNode()
+    camera = open_ros("ros2:tcp/127.0.0.1:1", cloud_topic=CLOUD_TOPIC)
+    monkeypatch.setattr(camera, "_graph", replace(camera._graph, join=lambda: node))
+    recording = LiveRecording("ros2:", camera)
+
+    def burst() -> None:
+        for _ in range(10):
+            node.show(cloud())
+
+    with ros_rig.publishing(lambda: node, cloud):
+        frames = recording.frames()
+        next(frames)
+        burst()
+        until(lambda: camera.lost >= 5)
+        next(frames)
+        frames.close()  # type: ignore[attr-defined]
+    assert any(line.startswith("lost      ") and "faster than they were read" in line for line in recording.lines())
 
 
 ROS1_CAMERA = """

@@ -28,17 +28,16 @@ from ropetrace.errors import ConfigError
 from ropetrace.evaluation.case1 import CONDITIONS, Case1Settings, scenario
 from ropetrace.recordings import open_recording
 from ropetrace.recordings.ros1_bag import Ros1Bag
-from ropetrace.recordings.ros_frames import frame_messages
 from ropetrace.recordings.ros_messages import CAMERA, CLOUD, IMAGE, RawMessage, decoded
-from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, diagnostics, header, typestore
+from ropetrace.results.ros_estimates import typestore
 from ropetrace.ros import messages
-from ropetrace.ros.messages import JOINTS, NUMBERS, POSES
+from ropetrace.ros.messages import NUMBERS
 from ropetrace.ros.rospy_graph import definition, master_uri, ros1_bytes, ros1_type
 from ropetrace.ros.simulated_cell import cell_config
 from ropetrace.sim.scenario import SimulatedScene
-from ropetrace.types import CloudFrame, Frame, Intrinsics, Motion, RgbdFrame, Status, Waypoints
+from ropetrace.types import RgbdFrame
 from ros_rig import children_of, free_port, listening, runs, until
-from ros_twins import path, pose_array, trajectory
+from ros_twins import published
 
 DEBIAN_PYTHON, DEBIAN_PACKAGES = "/usr/bin/python3", "/usr/lib/python3/dist-packages"
 
@@ -161,38 +160,6 @@ def core(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Core]:
         yield made
     finally:
         made.stop()
-
-
-def published() -> list[tuple[str, bytes]]:
-    """A message in CDR of every type that is published, also with lists that are empty."""
-    held = header(1_700_000_000_123_456_789, "camera")
-    lens = Intrinsics(4, 3, 5.0, 6.0, 1.5, 1.0)
-    depth = np.arange(12, dtype=np.uint16).reshape(3, 4)
-    color = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
-    points = np.arange(6, dtype=np.float32).reshape(2, 3)
-    frames: list[Frame] = [
-        RgbdFrame(1_700_000_000_000_000_001, depth, 0.001, lens, color),
-        CloudFrame(1_700_000_000_000_000_001, points, color[0, :2]),
-    ]
-    packed = [(message.type, bytes(message.data)) for frame in frames for message in frame_messages(frame)]
-    rows = np.arange(15.0).reshape(5, 3)
-    waypoints = Waypoints(rows, np.tile([0.1, 0.2, 0.3, 0.9], (5, 1)), np.arange(5.0))
-    motion = Motion(rows + 1, rows + 2, rows, rows, rows)
-    made = [
-        (PATH, path(held, waypoints)),
-        (PATH, path(held, Waypoints.none())),
-        (POSES, pose_array(held, waypoints)),
-        (TRAJECTORY, trajectory(held, waypoints, motion)),
-        (TRAJECTORY, trajectory(held, waypoints, None)),
-        *((DIAGNOSTICS, diagnostics(held, "näme", status, "why", {"a": "b", "": ""})) for status in Status),
-        (DIAGNOSTICS, diagnostics(held, "name", Status.OK, "", {})),
-        (JOINTS, messages.joint_state(held, ("a", "bcd"), np.array([1.0, 2.0]), None)),
-        (JOINTS, messages.joint_state(held, ("a",), None, np.array([-3.5]))),
-        (NUMBERS, messages.numbers(np.array([1.0, -2.0, 3.0]))),
-        (NUMBERS, messages.numbers(np.empty(0))),
-        (messages.TIME, messages.time_reference(held, 1_600_000_000_000_000_007)),
-    ]
-    return [*packed, *((name, bytes(typestore().serialize_cdr(message, name))) for name, message in made)]
 
 
 def plain(value: Any) -> Any:
@@ -450,6 +417,53 @@ def test_a_node_waits_for_roscore_and_ends_when_it_is_told_to(tmp_path: Path) ->
                 assert "Traceback" not in text.read_text(), text.read_text()
     finally:
         core.stop()
+
+
+BRAKING = """
+import time
+from ropetrace.ros import messages
+from ropetrace.ros.rospy_graph import RospyNode
+from ropetrace.ros.supervise import told_to_stop
+import numpy as np
+should_stop = told_to_stop()
+with RospyNode("braking") as node:
+    publisher, end = node.publisher("/velocities", messages.NUMBERS), None
+    while end is None or time.monotonic() < end:
+        publisher.put(messages.numbers(np.array([float(should_stop())])))
+        if should_stop() and end is None:
+            end = time.monotonic() + 1.5
+        time.sleep(0.02)
+"""
+
+ARM_THAT_COUNTS = """
+import os
+import rospy, std_msgs.msg
+braking = []
+def came(message):
+    if not braking:
+        print("moving", flush=True)
+    if message.data[0]:
+        braking.append(message.data)
+        if len(braking) == 20:
+            os._exit(0)
+rospy.init_node("arm")
+rospy.Subscriber("/velocities", std_msgs.msg.Float64MultiArray, came)
+rospy.spin()
+"""
+
+
+def test_what_a_node_says_while_it_brakes_is_heard_after_rosnode_kill(core: Core) -> None:
+    with subprocess.Popen([sys.executable, "-c", BRAKING], env=core.our_env) as process:
+        try:
+            with core.debian(ARM_THAT_COUNTS) as arm:
+                assert arm.stdout is not None
+                assert arm.stdout.readline() == "moving\n"
+                core.tool("rosnode", "kill", "/braking")
+                assert arm.wait(timeout=20) == 0
+            assert process.wait(timeout=20) == 0
+            until(lambda: "/braking" not in core.tool("rosnode", "list").split())
+        finally:
+            process.kill()
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -21,14 +22,15 @@ pytest.importorskip("pinocchio")
 from ropetrace.cli_node import Commands, Images, Reach, Robot, Router
 from ropetrace.errors import ConfigError
 from ropetrace.recordings.ros_messages import RawMessage, decoded
-from ropetrace.results.ros_estimates import PATH, TRAJECTORY
+from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY
 from ropetrace.ros.graph import Subscription
 from ropetrace.ros.kinematic_system import ArmSettings
 from ropetrace.ros.live_camera import CameraTopics
 from ropetrace.ros.messages import JOINTS, NUMBERS
 from ropetrace.ros.simulated_cell import cell_config
+from ropetrace.ros.supervise import end_all
 from ropetrace.ros.zenoh_graph import ZenohNode
-from ropetrace.ros.zenoh_session import Connection
+from ropetrace.ros.zenoh_session import Connection, open_router
 from ros_rig import children_of, free_endpoint, runs, until
 
 STARTED = 60.0
@@ -163,6 +165,69 @@ def test_no_node_outlives_all_even_if_that_is_killed(tmp_path: Path) -> None:
     until(lambda: not any(runs(child) for child in children))
 
 
+UNTIL_TOLD = """
+import signal, sys, time
+stop = []
+signal.signal(signal.SIGTERM, lambda *_: stop.append(1))
+print(flush=True)
+while not stop:
+    time.sleep(0.01)
+time.sleep(float(sys.argv[1]))
+"""
+
+
+def test_the_router_ends_when_all_others_have_ended() -> None:
+    """Wherever it stands in the list: one that was started again is its last."""
+    running = {}
+    for name, seconds in (("sim", 0.2), ("router", 0.0), ("kinematic_system", 0.4)):
+        command = [sys.executable, "-c", UNTIL_TOLD, str(seconds)]
+        running[name] = subprocess.Popen(command, stdout=subprocess.PIPE)
+    left = dict(running)
+    ended = []
+
+    def watch() -> None:
+        while left:
+            for name, process in list(left.items()):
+                if not runs(process.pid):
+                    del left[name]
+                    ended.append(name)
+            time.sleep(0.005)
+
+    try:
+        for process in running.values():
+            assert process.stdout is not None
+            process.stdout.readline()
+        thread = threading.Thread(target=watch)
+        thread.start()
+        end_all(running)
+        thread.join()
+    finally:
+        for process in running.values():
+            process.kill()
+            process.communicate()
+    assert ended[-1] == "router"
+    assert [process.returncode for process in running.values()] == [0, 0, 0]
+
+
+def test_a_node_whose_stderr_nobody_reads_goes_on(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    command = [sys.executable, "-m", "ropetrace", "node", "trajectory_tracker", "--diameter", "12mm"]
+    with subprocess.Popen([*command, "--router", endpoint], stderr=subprocess.PIPE) as process:
+        try:
+            assert process.stderr is not None
+            assert b"no router" in process.stderr.readline()
+            process.stderr.close()
+            with open_router(endpoint), ZenohNode("watcher", Connection(router=endpoint)) as watcher:
+                heard = watcher.subscription("/diagnostics", DIAGNOSTICS, depth=100)
+                # What it tells here it has told on stderr, too.
+                until(lambda: any("nothing came" in decoded(one).status[0].message for one in heard.take()), STARTED)
+            assert process.poll() is None
+            process.terminate()
+            assert process.wait(timeout=30) == 0
+        finally:
+            process.kill()
+
+
 def test_a_node_whose_supervisor_is_gone_before_it_starts_ends() -> None:
     with subprocess.Popen([sys.executable, "-c", ""]) as gone:
         gone.wait()
@@ -211,6 +276,8 @@ def test_a_domain_of_the_environment_that_is_none(monkeypatch: pytest.MonkeyPatc
         (["kinematic_system", "--diameter", "15mm"], "camera_pose"),
         (["all", "--diameter", "15mm"], "camera_pose"),
         (["track_deformable", "--diameter", "15mm", "--self-filter"], "--self-filter needs camera_pose"),
+        (["track_deformable", "--diameter", "15mm", "--self-filter", "--cloud-topic", "/c"], "leave out --cloud-topic"),
+        (["all", "--simulate", "--self-filter", "--cloud-topic", "/c"], "leave out --cloud-topic"),
         (["track_deformable"], "diameter is missing"),
         (["track_deformable", "--diameter", "15mm", "--depth-topic", "depth"], "no full name of a topic"),
         (["trajectory_tracker", "--diameter", "15mm", "--domain", "999"], "0 to 232"),

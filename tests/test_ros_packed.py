@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ropetrace.recordings.ros_messages import RawMessage
+from ropetrace.errors import FrameError
+from ropetrace.recordings.ros_messages import RawMessage, stamp_and_frame
 from ropetrace.results.ros_estimates import PATH, TRAJECTORY, header, make, typestore
-from ropetrace.results.ros_packed import pack_path, pack_poses, pack_trajectory, unpack_path, unpack_trajectory
+from ropetrace.results.ros_packed import (
+    MOST_WAYPOINTS,
+    pack_path,
+    pack_poses,
+    pack_trajectory,
+    unpack_path,
+    unpack_trajectory,
+)
 from ropetrace.ros import messages
-from ropetrace.types import Motion, Waypoints
+from ropetrace.types import FloatArray, Motion, Waypoints
 from ros_twins import path, pose_array, trajectory
 
+POINT = "trajectory_msgs/msg/MultiDOFJointTrajectoryPoint"
 STAMP = 1_700_000_000_123_456_789
 
 
@@ -65,14 +75,33 @@ def test_damage_is_refused_or_read_as_rosbags_reads_it(data: st.DataObject, whic
     for _ in range(data.draw(st.integers(0, 3))):
         if spoilt:
             spoilt[data.draw(st.integers(0, len(spoilt) - 1))] = data.draw(st.integers(0, 255))
-    found = unpack_path(bytes(spoilt)) if which else unpack_trajectory(bytes(spoilt))
+    found = unpacked(bytes(spoilt)) if which else unpack_trajectory(bytes(spoilt))
     if found is None:
         return
-    body = typestore().deserialize_cdr(bytes(spoilt), PATH if which else TRAJECTORY)
+    try:
+        body = typestore().deserialize_cdr(bytes(spoilt), PATH if which else TRAJECTORY)
+    except Exception:
+        return  # It looks at what is not used here, too: names that are no UTF-8, for one.
+    read: tuple[list[Any], list[Any], list[Any]]
     if which:
-        assert len(body.poses) == len(found)
+        read = [(stamped.pose.position, stamped.pose.orientation) for stamped in body.poses], [], []
     else:
-        assert len(body.points[0].transforms if body.points else []) == len(found[0])
+        point = body.points[0] if body.points else make(POINT, [], [], [], None)
+        read = (
+            [(at.translation, at.rotation) for at in point.transforms],
+            [twist.linear for twist in point.velocities],
+            [twist.linear for twist in point.accelerations],
+        )
+    rows = [[at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w] for at, turn in read[0]]
+    np.testing.assert_array_equal(found[0], np.reshape(rows, (-1, 7)))
+    for ours, theirs in zip(found[1:], read[1:], strict=True):
+        np.testing.assert_array_equal(ours, np.reshape([[v.x, v.y, v.z] for v in theirs], (-1, 3)))
+
+
+def unpacked(data: bytes) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """A path as a trajectory of unknown motion."""
+    poses = unpack_path(data)
+    return None if poses is None else (poses, np.empty((0, 3)), np.empty((0, 3)))
 
 
 @pytest.mark.parametrize("frames", [("camera", "map"), ("camera", "camera_2")])
@@ -87,6 +116,40 @@ def test_a_path_of_another_maker_is_read_too(frames: tuple[str, str]) -> None:
     found = messages.waypoints(RawMessage("/path", PATH, "cdr", 0, data))
     np.testing.assert_array_equal(found.positions, waypoints.positions)
     np.testing.assert_array_equal(found.quaternions, waypoints.quaternions)
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_a_path_with_one_pose_of_another_frame_is_left_to_rosbags(place: int) -> None:
+    waypoints, _ = rope(3)
+    body = path(header(STAMP, "camera"), waypoints)
+    body.poses[place].header = header(STAMP, "gopher")
+    assert unpack_path(bytes(typestore().serialize_cdr(body, PATH))) is None
+
+
+def test_more_waypoints_than_a_rope_has_are_refused() -> None:
+    """Before their names are made, which would take long."""
+    count = 40 * MOST_WAYPOINTS
+    data = b"\0\1\0\0" + struct.pack("<iII", 0, 0, 1) + bytes(4) + struct.pack("<I", count) + bytes(56 * count)
+    with pytest.raises(FrameError, match="4000000 joints: expected 100000 at most"):
+        unpack_trajectory(data)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "data"),
+    [
+        ("ros1", struct.pack("<IIII", 0, 2**32 - 1, 0, 0)),
+        ("cdr", b"\0\1\0\0" + struct.pack("<iIII", 2**31 - 1, 10**9, 1, 0)),
+        ("cdr", b"\0\1\0\0" + struct.pack("<iIII", -1, 0, 1, 0)),
+    ],
+)
+def test_a_wild_stamp_is_an_error_of_its_message(encoding: str, data: bytes) -> None:
+    with pytest.raises(FrameError, match=r"/path: the stamp .* is no time from 1970 to 2038"):
+        stamp_and_frame(RawMessage("/path", PATH, encoding, 0, data))
+
+
+def test_the_last_stamp_is_one() -> None:
+    data = b"\0\1\0\0" + struct.pack("<iIII", 2**31 - 1, 10**9 - 1, 1, 0)
+    assert stamp_and_frame(RawMessage("/path", PATH, "cdr", 0, data))[0] == 2**31 * 10**9 - 1
 
 
 def test_a_trajectory_of_another_maker_is_read_too() -> None:

@@ -10,42 +10,12 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from ropetrace.recordings.ros_frames import frame_messages
-from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, diagnostics, header, typestore
-from ropetrace.ros import messages
-from ropetrace.ros.messages import JOINTS, NUMBERS, POSES
-from ropetrace.types import CloudFrame, Frame, Intrinsics, Motion, RgbdFrame, Status, Waypoints
+from ropetrace.results.ros_estimates import PATH, header, typestore
+from ropetrace.ros.messages import POSES
 from ros_rig import routed, until
-from ros_twins import path, pose_array, trajectory
-
-ROWS = np.arange(15.0).reshape(5, 3)
-WAYPOINTS = Waypoints(ROWS, np.tile([0.5, 0.5, 0.5, 0.5], (5, 1)), np.arange(5.0))
-STAMP = 1_700_000_000_123_456_789
-
-
-def packed() -> list[tuple[str, bytes]]:
-    """A message in CDR of every type that the nodes publish or record."""
-    held = header(STAMP, "camera")
-    lens = Intrinsics(4, 3, 5.0, 6.0, 1.5, 1.0)
-    color = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
-    frames: list[Frame] = [
-        RgbdFrame(STAMP, np.arange(12, dtype=np.uint16).reshape(3, 4), 0.001, lens, color),
-        CloudFrame(STAMP, np.arange(6, dtype=np.float32).reshape(2, 3), color[0, :2]),
-    ]
-    made = [
-        (PATH, path(held, WAYPOINTS)),
-        (PATH, path(held, Waypoints.none())),
-        (POSES, pose_array(held, WAYPOINTS)),
-        (TRAJECTORY, trajectory(held, WAYPOINTS, Motion(ROWS + 1, ROWS + 2, ROWS, ROWS, ROWS))),
-        (DIAGNOSTICS, diagnostics(held, "näme", Status.OK, "why", {"a": "b", "": ""})),
-        (JOINTS, messages.joint_state(held, ("a", "bcd"), np.array([1.0, 2.0]), None)),
-        (NUMBERS, messages.numbers(np.array([1.0, -2.0, 3.0]))),
-    ]
-    images = [(message.type, bytes(message.data)) for frame in frames for message in frame_messages(frame)]
-    return [*images, *((name, bytes(typestore().serialize_cdr(message, name))) for name, message in made)]
+from ros_twins import ROWS, STAMP, WAYPOINTS, path, published
 
 
 def definition(name: str) -> str:
@@ -56,16 +26,15 @@ def definition(name: str) -> str:
 def test_mcap_ros2_decodes_and_encodes_every_message_to_the_same_bytes() -> None:
     dynamic = pytest.importorskip("mcap_ros2._dynamic", reason="mcap-ros2-support is not installed")
     seen = set()
-    for name, data in packed():
+    for name, data in published():
         decoded = dynamic.generate_dynamic(name, definition(name))[name](data)
         assert bytes(dynamic.serialize_dynamic(name, definition(name))[name](decoded)) == data, name
         seen.add(name)
-    assert len(seen) == 9
+    assert len(seen) == 10
 
 
 READER = """
 import json, sys
-import numpy as np
 from zenoh_ros2_sdk import ROS2Subscriber
 from zenoh_ros2_sdk.discovery import get_topic_names_and_types
 port, definition = int(sys.argv[1]), sys.argv[2]

@@ -19,12 +19,11 @@ import pytest
 
 from ropetrace.errors import ConfigError, MissingExtraError, RosError
 from ropetrace.live.ros_camera import open_ros
-from ropetrace.recordings.ros_frames import frame_messages
 from ropetrace.recordings.ros_messages import CAMERA, IMAGE, decoded
 from ropetrace.results.ros_estimates import make
 from ropetrace.ros.rclpy_graph import RclpyNode
 from ropetrace.types import Intrinsics, RgbdFrame
-from ros_rig import until
+from ros_rig import publishing, until
 
 STRING = "std_msgs/msg/String"
 KNOWN = (STRING, IMAGE, CAMERA)
@@ -89,6 +88,7 @@ class Node:
         self.publishers: list[Publisher] = []
         self.reads: list[SimpleNamespace] = []
         self.waiting: list[tuple[Callable[[bytes], None], bytes]] = []
+        self.timers: list[SimpleNamespace] = []
         Graph.nodes.append(self)
 
     def create_publisher(self, msg_type: type, topic: str, qos_profile: QoSProfile) -> Publisher:
@@ -100,6 +100,10 @@ class Node:
     ) -> None:
         assert raw, "messages of rclpy's own classes"
         self.reads.append(SimpleNamespace(kind=msg_type, topic=topic, callback=callback, qos=qos_profile))
+
+    def create_timer(self, timer_period_sec: float, callback: Callable[[], None]) -> None:
+        due = time.monotonic() + timer_period_sec
+        self.timers.append(SimpleNamespace(period=timer_period_sec, callback=callback, due=due))
 
     def get_publishers_info_by_topic(self, topic_name: str, no_mangle: bool = False) -> list[SimpleNamespace]:
         return [
@@ -142,6 +146,10 @@ class SingleThreadedExecutor:
                 while node.waiting:
                     callback, data = node.waiting.pop(0)
                     callback(data)
+                for timer in node.timers:
+                    if time.monotonic() >= timer.due:
+                        timer.due += timer.period
+                        timer.callback()
             time.sleep(0.002)
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
@@ -236,21 +244,17 @@ def test_it_fits_reliable_and_best_effort_peers_and_leaves_the_signals_alone() -
 def test_a_topic_of_another_type_is_told_until_it_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ropetrace.ros.rclpy_graph.LOOK_EVERY", 0.01)
 
-    def looked() -> str:
-        reader.wait(0.02)
-        return read.problem()
-
     with RclpyNode("reader") as reader:
         read = reader.subscription("/depth", IMAGE)
         with RclpyNode("camera") as camera:
             camera.publisher("/depth", STRING)
-            until(looked)
+            until(read.problem)
             assert (
                 read.problem()
                 == "/depth of node camera is std_msgs/msg/String, expected sensor_msgs/msg/Image: not read"
             )
             assert reader.topics() == {"/depth": STRING}
-        until(lambda: not looked())
+        until(lambda: not read.problem())
         assert reader.topics() == {}
 
 
@@ -283,26 +287,10 @@ def test_the_live_source_takes_rclpy_where_it_can_be_imported() -> None:
     lens = Intrinsics(4, 3, 5.0, 6.0, 1.5, 1.0)
     depth = np.arange(12, dtype=np.uint16).reshape(3, 4)
     camera = open_ros("ros2:", color_topic="")
-    stop = threading.Event()
-
-    def publish() -> None:
-        with RclpyNode("camera") as node:
-            made = {}
-            while not stop.wait(0.02):
-                for message in frame_messages(RgbdFrame(time.time_ns(), depth, 0.001, lens, None)):
-                    if message.topic not in made:
-                        made[message.topic] = node.publisher(message.topic, message.type)
-                    made[message.topic].put_packed(bytes(message.data))
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
+    with publishing(lambda: RclpyNode("camera"), lambda: RgbdFrame(time.time_ns(), depth, 0.001, lens, None)):
         camera.connect()
         capture = camera.fetch(10.0)
         camera.disconnect()
-    finally:
-        stop.set()
-        thread.join()
     assert capture is not None
     assert isinstance(capture.event, RgbdFrame), capture.event
     np.testing.assert_array_equal(capture.event.depth, depth)

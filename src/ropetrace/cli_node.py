@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -18,7 +17,8 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, arg
 from ropetrace.cli_source import Rope
 from ropetrace.errors import ConfigError, OutputError, import_extra
 from ropetrace.ros.joining import Way, best_way, domain_of_environment
-from ropetrace.ros.supervise import end_with_supervisor, supervise, told_to_stop
+from ropetrace.ros.saying import say
+from ropetrace.ros.supervise import ROUTER, end_with_supervisor, supervise, told_to_stop
 
 if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
@@ -81,7 +81,7 @@ class Reach:
         domain = self.domain if self.domain is not None else domain_of_environment()
         connection = Connection(self.router, self.mode, self.listen, self.multicast, domain, self.humble)
         if not router_answers(self.router):
-            print(f"{name}: no router at {self.router} yet: {START_ROUTER}", file=sys.stderr, flush=True)
+            say(f"{name}: no router at {self.router} yet: {START_ROUTER}")
         return ZenohNode(name, connection)
 
 
@@ -143,6 +143,7 @@ class TrackDeformable:
         topics = CameraTopics(images.depth_topic, images.color_topic, images.camera_topic, images.cloud_topic)
         if not self.self_filter:
             return _run(self.reach, "track_deformable", lambda node: TrackDeformable(node, config, topics))
+        _check_images(images)
         _check_camera_pose(config, "--self-filter")
         from ropetrace.control.arm import Arm
         from ropetrace.ros.robot_filter import RobotFilter
@@ -224,7 +225,7 @@ class Router:
 
         should_stop = told_to_stop()
         with closing(open_router(self.router)):
-            print(f"router: listening at {self.router}", file=sys.stderr, flush=True)
+            say(f"router: listening at {self.router}")
             while not should_stop():
                 time.sleep(0.1)
         return 0
@@ -245,6 +246,8 @@ class All:
     """With the simulated camera and arm, and their settings in the place of a rope's."""
 
     def run(self) -> int:
+        if self.self_filter:
+            _check_images(self.images)
         way = self.reach.way()
         if way == "zenoh":
             import_extra("zenoh", "ros2")
@@ -275,7 +278,7 @@ class All:
                 from ropetrace.ros.zenoh_session import router_answers
 
                 if not router_answers(self.reach.router):
-                    commands = {"router": ["--router", self.reach.router], **commands}
+                    commands = {ROUTER: ["--router", self.reach.router], **commands}
             return supervise(commands, told_to_stop())
 
 
@@ -307,9 +310,9 @@ def _run(reach: Reach, name: str, make: Callable[[RosNode], Any]) -> int:
     should_stop = told_to_stop()
     with reach.node(name) as node:
         made = make(node)
-        print(f"{name}: running", file=sys.stderr, flush=True)
+        say(f"{name}: running")
         made.run(should_stop)
-    print(f"{name}: ended", file=sys.stderr, flush=True)
+    say(f"{name}: ended")
     return 0
 
 
@@ -323,6 +326,11 @@ def _flags(options: Any) -> list[str]:
         flag = f"--{item.name.replace('_', '-')}"
         flags += [flag] if value is True else [flag, str(value)]
     return flags
+
+
+def _check_images(images: Images) -> None:
+    if images.cloud_topic is not None:
+        raise ConfigError("--self-filter takes the arm out of images, not of clouds: leave out --cloud-topic")
 
 
 def _check_camera_pose(config: RopeConfig, who: str) -> None:

@@ -35,6 +35,8 @@ class Capture:
 class Camera(Protocol):
     """A camera; all of its methods are called by one thread.
 
+    One that knows how many frames it has lost since its first may say so in an attribute ``lost``.
+
     Attributes
     ----------
     kind : str

@@ -23,6 +23,9 @@ GIVE_UP_SECONDS = 30.0
 INFO_SECONDS = 2.0
 """How long `info` looks at a camera."""
 
+MOST_GAPS = 100
+"""Times without frames that are told one by one."""
+
 START_FRAMES = 2
 """The first frames of a run wait for the compiler, or for its cache: what is dropped meanwhile is counted apart."""
 
@@ -50,7 +53,7 @@ class LiveRecording:
     intrinsics : Intrinsics, optional
         Of the newest frame that was taken; None before the first, and for clouds.
     problems : list of str
-        Times without frames, a sentence each.
+        Times without frames, a sentence each for the first `MOST_GAPS`.
     dropped : int
         Frames that nobody took since `frames` was called, because they were busy with one before.
     dropped_at_start : int
@@ -74,6 +77,8 @@ class LiveRecording:
         self._stream: Stream | None = None
         self._clock = ClockWatch()
         self._newest: Capture | None = None
+        self._gaps = 0
+        self._lost_before = 0
 
     def frames(self, start: int = 0, limit: int | None = None) -> Iterator[Event]:
         """The newest frame each time, until `limit` or without an end.
@@ -94,6 +99,7 @@ class LiveRecording:
         self.close()
         self.dropped = self.dropped_at_start = 0
         self._clock, self._newest = ClockWatch(), None
+        self._lost_before = self._lost()
         stream = self._stream = Stream(self._camera, self.on_event)
         begin = heard = time.monotonic()
         silent = 0.0
@@ -134,7 +140,7 @@ class LiveRecording:
 
     def _stop(self, stream: Stream) -> None:
         if not stream.close():
-            note(self.problems, f"the {self._camera.kind} hangs and did not stop: unplug it")
+            note(self.problems, f"the {self._camera.kind} hangs and did not stop: start it anew, or unplug it")
 
     def age(self) -> float:
         """Seconds since the stamp of the frame that was taken last; since its arrival where the camera's clock is not
@@ -152,8 +158,10 @@ class LiveRecording:
         ]
 
     def clock_lines(self) -> list[str]:
-        """What the stamps did that a clock would not, for people; most often nothing."""
-        return self._clock.lines()
+        """What the stamps did that a clock would not, and what was lost on the way, for people; most often nothing."""
+        lost = self._lost() - self._lost_before
+        lines = [f"lost      {lost} frames that came faster than they were read"] if lost else []
+        return [*lines, *self._clock.lines()]
 
     def info(self) -> RecordingInfo:
         """Look at the camera for two seconds, and say what comes.
@@ -200,14 +208,28 @@ class LiveRecording:
     def _missing(self, stream: Stream, seconds: float) -> BadFrame:
         assert self._newest is not None
         since = time.monotonic_ns() - self._newest.arrival_ns
-        why = stream.trouble or "is it still plugged in?"
+        why = stream.trouble or "is it still connected, and running?"
         return BadFrame(
             self._newest.event.stamp_ns + since, f"the {self._camera.kind} gave no frame for {seconds:.1f} s: {why}"
         )
 
     def _silent(self, stream: Stream, seconds: float) -> RecordingError:
-        why = stream.trouble or "it is there, but silent: unplug it, plug it in again, and start anew"
+        why = stream.trouble or "it is there, but silent: start it anew, or unplug it and plug it in again"
         return RecordingError(f"{self.path}: the {self._camera.kind} gave no frame for {seconds:.1f} s: {why}")
 
+    def _lost(self) -> int:
+        return int(getattr(self._camera, "lost", 0))
+
     def _note_gap(self, after: float, seconds: float) -> None:
+        self._gaps += 1
+        more = self._gaps - MOST_GAPS
+        if more > 0:
+            if more > 1:
+                self.problems.remove(_more_gaps(more - 1))
+            self.problems.append(_more_gaps(more))
+            return
         note(self.problems, f"the {self._camera.kind} gave no frame for {seconds:.1f} s, {after:.1f} s after the start")
+
+
+def _more_gaps(count: int) -> str:
+    return f"and {count} more times without frames"

@@ -68,16 +68,23 @@ class RosCamera:
         What is read.
     color : bool, optional
         Whether images have their colour; None: if any comes.
+
+    Attributes
+    ----------
+    lost : int
+        Frames that came faster than they were read, or nearly all at once. Those before the first do not count.
     """
 
     def __init__(self, graph: Graph, topics: CameraTopics, color: bool | None = None) -> None:
         self.kind = graph.kind
+        self.lost = 0
         self._graph = graph
         self._topics = topics
         self._color = color
         self._node: RosNode | None = None
         self._camera: LiveCamera | None = None
         self._first: Capture | None = None
+        self._skipped: int | None = None
 
     def connect(self) -> None:
         try:
@@ -88,6 +95,7 @@ class RosCamera:
                 )
             while self._camera.take() is not None:
                 """What is left from before."""
+            self._skipped = None
             self._await_first()
         except RosError as error:
             self.disconnect()
@@ -99,11 +107,14 @@ class RosCamera:
     def fetch(self, timeout: float) -> Capture | None:
         if self._first is not None:
             first, self._first = self._first, None
+            self._count_lost()
             return first
         assert self._node is not None
         end = time.monotonic() + timeout
         while (capture := self._next()) is None and (left := end - time.monotonic()) > 0:
             self._node.wait(left)
+        if capture is not None:
+            self._count_lost()
         return capture
 
     def disconnect(self) -> None:
@@ -111,6 +122,13 @@ class RosCamera:
         if self._graph.leaves and self._node is not None:
             self._node.close()
             self._node = self._camera = None
+
+    def _count_lost(self) -> None:
+        assert self._camera is not None
+        skipped = self._camera.skipped
+        if self._skipped is not None:
+            self.lost += skipped - self._skipped
+        self._skipped = skipped
 
     def _next(self) -> Capture | None:
         assert self._camera is not None

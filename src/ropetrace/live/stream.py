@@ -100,7 +100,7 @@ class Stream:
         try:
             while not self._stopping.is_set() and time.monotonic() - since < RESTART_SECONDS:
                 capture = self._camera.fetch(FETCH_SECONDS)
-                if capture is not None:
+                if capture is not None and not self._stopping.is_set():
                     since = time.monotonic()
                     self._put(capture)
         except CameraGoneError as error:

@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from ropetrace.errors import FrameError
 from ropetrace.recordings import images
 from ropetrace.recordings.base import one_line
+from ropetrace.results.ros_estimates import LAST_STAMP, NANOSECONDS
 from ropetrace.types import MAX_IMAGE_PIXELS, Intrinsics
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -105,7 +106,7 @@ def stamp_and_frame(message: RawMessage) -> tuple[int, str]:
     Raises
     ------
     FrameError
-        If the message is too short or of an unknown encoding.
+        If the message is too short or of an unknown encoding, or the stamp is none: before 1970, after 2038.
     """
     data = message.data
     try:
@@ -120,7 +121,10 @@ def stamp_and_frame(message: RawMessage) -> tuple[int, str]:
             raise FrameError(f"{message.topic}: messages encoded as {message.encoding!r}: only cdr and ros1 are read")
     except (struct.error, IndexError):
         raise FrameError(f"{message.topic}: a message of {len(data)} bytes has no whole header") from None
-    return seconds * 10**9 + nanoseconds, text.decode(errors="replace")
+    stamp_ns = seconds * NANOSECONDS + nanoseconds
+    if not 0 <= stamp_ns <= LAST_STAMP:
+        raise FrameError(f"{message.topic}: the stamp {seconds} s and {nanoseconds} ns is no time from 1970 to 2038")
+    return stamp_ns, text.decode(errors="replace")
 
 
 def decoded(message: RawMessage) -> Any:

@@ -12,12 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from ropetrace.errors import FrameError
+from ropetrace.results.ros_estimates import NANOSECONDS
 from ropetrace.types import FloatArray, Motion, Waypoints
 
 _PLAIN_CDR = b"\x00\x01\x00\x00"
 """Little endian, without parameters."""
 
-_NANOSECONDS = 1_000_000_000
+MOST_WAYPOINTS = 100_000
+"""That are taken from a message: a rope of a kilometre."""
 
 
 def pack_path(stamp_ns: int, frame_id: str, waypoints: Waypoints) -> bytes:
@@ -91,8 +94,11 @@ def unpack_path(data: bytes | memoryview) -> FloatArray | None:
     first = at + header_size + -(at - 4 + header_size) % 8
     if len(data) != first + 56 + (count - 1) * row.itemsize:
         return None
+    held = data[4 : 4 + header_size]
+    if data[at : at + header_size] != held:
+        return None
     rows = np.frombuffer(data, row, count - 1, first + 56)
-    if count > 1 and (rows["header"] != np.frombuffer(data, f"V{header_size}", 1, 4)).any():
+    if count > 1 and (rows["header"] != np.frombuffer(held, f"V{header_size}")).any():
         return None
     return np.vstack((np.frombuffer(data, "<f8", 7, first)[None], rows["pose"])).astype(float)
 
@@ -104,6 +110,11 @@ def unpack_trajectory(data: bytes | memoryview) -> tuple[FloatArray, FloatArray,
     -------
     tuple or None
         Metres and seconds, of no waypoints where the motion was not known; None if it is made in another way.
+
+    Raises
+    ------
+    FrameError
+        If there are more than `MOST_WAYPOINTS`.
     """
     found = _begin(data)
     if found is None or len(data) < found[0] + 8:
@@ -115,6 +126,8 @@ def unpack_trajectory(data: bytes | memoryview) -> tuple[FloatArray, FloatArray,
         return (np.empty((0, 7)), empty, empty) if bytes(data[at:]) == bytes(8) else None
     if count > len(data) // 56:
         return None
+    if count > MOST_WAYPOINTS:
+        raise FrameError(f"{count} joints: expected {MOST_WAYPOINTS} at most")
     names = _joint_names(count)
     if data[at : at + len(names)] != names:
         return None
@@ -137,7 +150,7 @@ def unpack_trajectory(data: bytes | memoryview) -> tuple[FloatArray, FloatArray,
 def _header(stamp_ns: int, frame_id: str) -> bytes:
     """A std_msgs/Header that begins at a multiple of four."""
     name = frame_id.encode() + b"\0"
-    return struct.pack("<iII", *divmod(stamp_ns, _NANOSECONDS), len(name)) + name
+    return struct.pack("<iII", *divmod(stamp_ns, NANOSECONDS), len(name)) + name
 
 
 def _begin(data: bytes | memoryview) -> tuple[int, int] | None:
@@ -164,11 +177,11 @@ def _poses(waypoints: Waypoints) -> FloatArray:
     return np.hstack((waypoints.positions, waypoints.quaternions)).astype("<f8", copy=False)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def _joint_names(count: int) -> bytes:
-    """The names of the waypoints, a sequence of strings that begins at a multiple of four."""
-    packed = struct.pack("<I", count)
+    """The names of one or more waypoints, a sequence of strings that begins at a multiple of four."""
+    parts = [struct.pack("<I", count)]
     for number in range(count):
         name = f"waypoint_{number}\0".encode()
-        packed = _padded(packed, 4) + struct.pack("<I", len(name)) + name
-    return packed
+        parts += [struct.pack("<I", len(name)), name, bytes(-len(name) % 4)]
+    return b"".join(parts[:-1])

@@ -12,6 +12,9 @@ from typing import Any, Protocol, Self
 from ropetrace.errors import ConfigError
 from ropetrace.recordings.ros_messages import MAX_MESSAGE_BYTES, RawMessage
 
+LONGEST_BRAKING = 2.0
+"""For which a node that is told to end goes on until what it moves is at rest, seconds."""
+
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
@@ -56,20 +59,24 @@ class Subscription:
         What is read.
     others : dict of str to str
         Who publishes something else under this name, in words, each by a key of the graph's own.
+    displaced : int
+        Messages that made room for newer ones before they were taken.
     """
 
     def __init__(self, topic: str, type_name: str, depth: int, arrived: threading.Event) -> None:
         self.topic = topic
         self.type = type_name
         self.others: dict[str, str] = {}
+        self.displaced = 0
+        self._lock = threading.Lock()
         self._messages: deque[RawMessage] = deque(maxlen=depth)
         self._arrived = arrived
 
     def take(self) -> list[RawMessage]:
         """The messages since the last call, oldest first; ``log_time_ns`` is when each came."""
-        taken = []
-        while self._messages:
-            taken.append(self._messages.popleft())
+        with self._lock:
+            taken = list(self._messages)
+            self._messages.clear()
         return taken
 
     def newest(self) -> RawMessage | None:
@@ -84,7 +91,9 @@ class Subscription:
     def receive(self, data: bytes, encoding: str) -> None:
         """Keep a message that came; called by threads of the graph."""
         if len(data) <= MAX_MESSAGE_BYTES:
-            self._messages.append(RawMessage(self.topic, self.type, encoding, time.time_ns(), data))
+            with self._lock:
+                self.displaced += len(self._messages) == self._messages.maxlen
+                self._messages.append(RawMessage(self.topic, self.type, encoding, time.time_ns(), data))
             self._arrived.set()
 
 

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from ropetrace.control.arm import Arm
 from ropetrace.control.controller import TracingController
-from ropetrace.control.limits import Command, GuardOptions, ToolLimits
+from ropetrace.control.limits import Command, GuardOptions, Reason, ToolLimits
 from ropetrace.control.tracing import Phase, TracingSettings
 from ropetrace.errors import ConfigError, FrameError
 from ropetrace.motion.filters import transition
-from ropetrace.recordings.ros_messages import RawMessage, stamp_and_frame
-from ropetrace.results.ros_estimates import PATH, TRAJECTORY, header, topic_of
+from ropetrace.recordings.ros_messages import stamp_and_frame
+from ropetrace.results.ros_estimates import NANOSECONDS, PATH, TRAJECTORY, header, topic_of
 from ropetrace.ros import messages
-from ropetrace.ros.graph import RosNode, check_topic
-from ropetrace.ros.messages import JOINTS, NUMBERS, TIME
+from ropetrace.ros.graph import LONGEST_BRAKING, RosNode, check_topic
+from ropetrace.ros.messages import JOINTS, NUMBERS, TIME, JointReading
 from ropetrace.ros.reporting import Reporter
+from ropetrace.ros.track_deformable import MAX_FUTURE
 from ropetrace.types import Estimate, FloatArray, Motion, Status, Waypoints
 
 MARGIN = 0.01
@@ -32,11 +34,14 @@ JOINTS_FRESH = 0.1
 ARM_GONE = 1.0
 """An arm that has said nothing for this long is gone, seconds; when it is back, all begins from where it stands."""
 
+JOINTS_KEPT = 16
+"""Messages on the joints' topic between two steps: others than the arm may publish there, such as a gripper."""
+
 LONGEST_RESPONSE = 0.05
 """Of an arm, seconds."""
 
-LONGEST_BRAKING = 2.0
-"""For which a node that is told to stop goes on until the arm is at rest, seconds."""
+REST_TOLD = 0.2
+"""For which an arm at rest is still told so at the end, seconds: a message may be lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +85,7 @@ class ReceivedMotion:
 
     @property
     def stamp_ns(self) -> int | None:
-        """Of the newest frame whose motion is known, nanoseconds."""
+        """Of the frame whose motion came last, nanoseconds."""
         return None if self._known is None else self._known[0]
 
     def announce(self, motion: Motion) -> None:
@@ -88,8 +93,8 @@ class ReceivedMotion:
         self._next = motion
 
     def update(self, stamp_ns: int, waypoints: Waypoints) -> Motion | None:
-        """Take the waypoints whose motion was announced; a stamp that is not newer adds nothing."""
-        if self._next is not None and (self._known is None or stamp_ns > self._known[0]):
+        """Take the waypoints whose motion was announced, whatever was known before: clocks are set back, too."""
+        if self._next is not None:
             self._known = stamp_ns, waypoints, self._next
         return self._next
 
@@ -118,7 +123,7 @@ class KinematicSystem:
     JointState with names and a stamp. Beside them ``command_basis`` has the stamp of the newest image behind each.
     Nothing is sent before the arm's joints are known. Where the rope, its motion or the joints' positions are missing
     or too old, the arm brakes, as `control.controller` has it. After an arm that was gone for `ARM_GONE` has come back,
-    the tracing begins anew.
+    the tracing begins anew; not if it was found elsewhere than it was sent: that arm stays at rest.
 
     Parameters
     ----------
@@ -154,56 +159,75 @@ class KinematicSystem:
         self._motion = ReceivedMotion()
         self._paths = node.subscription(topic_of(0, "centerline"), PATH, depth=10)
         self._moving = node.subscription(topic_of(0, "motion"), TRAJECTORY)
-        self._joints = node.subscription(self.settings.joint_topic, JOINTS)
+        self._joints = node.subscription(self.settings.joint_topic, JOINTS, JOINTS_KEPT)
         self._velocities = node.publisher(self.settings.command_topic, NUMBERS)
         self._commands = node.publisher(topic_of(0, "joint_commands"), JOINTS)
         self._basis = node.publisher(topic_of(0, "command_basis"), TIME)
         self._reporter = Reporter(node)
         self._controller: TracingController | None = None
-        self._position: FloatArray | None = None
-        self._position_time = -math.inf
+        self._reading: JointReading | None = None
+        self._heard = -math.inf
         self._fault = ""
+        self._astray = False
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Control at the fixed rate until told to stop; then bring the arm to rest."""
+        """Control at the fixed rate until told to stop, or something fails; then bring the arm to rest."""
+        try:
+            for now in self._periods():
+                if should_stop():
+                    break
+                self.step(now)
+        finally:
+            self._come_to_rest()
+
+    def _periods(self) -> Iterator[float]:
+        """Each period's time, seconds since 1970."""
         due = time.monotonic()
-        stop_at = math.inf
-        while time.monotonic() < stop_at and not (should_stop() and self.at_rest):
-            if should_stop() and stop_at == math.inf:
-                stop_at = time.monotonic() + LONGEST_BRAKING
-            self.step(time.time(), "told to stop" if should_stop() else None)
+        while True:
+            yield time.time()
             due = max(due + self.period, time.monotonic() - self.period)
             time.sleep(max(due - time.monotonic(), 0.0))
 
-    @property
-    def at_rest(self) -> bool:
-        """Whether the arm is told to stand still."""
-        return self._controller is None or self._controller.guard.at_rest
+    def _come_to_rest(self) -> None:
+        """Brake, whatever else is known, and tell the arm for a while that it is at rest."""
+        if self._controller is None:
+            return
+        guard, unknown = self._controller.guard, np.full(self._arm.count, np.nan)
+        end = time.monotonic() + LONGEST_BRAKING
+        rest_end = math.inf
+        for now in self._periods():
+            command = guard.step(now, unknown, None, now)
+            # What fails here may be what has ended the node; the next command may still arrive.
+            with contextlib.suppress(Exception):
+                self._send(now, command)
+            if guard.at_rest:
+                rest_end = min(rest_end, time.monotonic() + REST_TOLD)
+            if time.monotonic() > min(end + REST_TOLD, rest_end):
+                return
 
-    def step(self, now: float, stop: str | None = None) -> Command | None:
+    def step(self, now: float) -> Command | None:
         """One control step.
 
         Parameters
         ----------
         now : float
             Seconds since 1970.
-        stop : str, optional
-            A reason to bring the arm to rest.
 
         Returns
         -------
         Command or None
             What was sent; None where nothing was, since there is no arm.
         """
-        self._learn_joints(now)
-        age = now - self._position_time
-        if self._controller is not None and age > ARM_GONE and self._controller.guard.at_rest:
+        self._learn_joints()
+        silent = time.monotonic() - self._heard
+        if self._controller is not None and silent > ARM_GONE and self._controller.guard.at_rest and not self._astray:
             self._controller = None
-        if self._controller is None and age <= JOINTS_FRESH and self._position is not None:
+        fresh = None if self._reading is None else position_at(now, self._reading)
+        if self._controller is None and fresh is not None:
             self._motion.reset()
             self._controller = TracingController(
                 self._arm,
-                self._position,
+                fresh,
                 self._base_from_camera,
                 self._motion,
                 self.period,
@@ -218,34 +242,41 @@ class KinematicSystem:
             told = self._fault or self._joints.problem() or f"no arm: nothing came on {self._joints.topic}"
             self._reporter.tell(Status.LOST, told)
             return None
-        fresh = self._position if age <= JOINTS_FRESH else None
-        if stop is None:
-            step, command = self._controller.act(now, fresh)
-            phase = "" if step is None else str(step.phase)
-        else:
-            command, phase = self._controller.guard.step(now, self._believed(fresh), None, now, stop), ""
+        step, command = self._controller.act(now, fresh)
+        self._astray = command.reason is Reason.TRACKING
         self._send(now, command)
+        phase = "" if step is None else str(step.phase)
         if fresh is None:
-            self._reporter.tell(Status.LOST, self._fault or f"{self._joints.topic} is silent for {age:.2f} s: braking")
+            told = self._fault or f"{self._joints.topic} is silent for {silent:.2f} s"
+            self._reporter.tell(Status.LOST, f"braking: {told}")
         elif command.reason is None or phase == Phase.DONE:
             self._reporter.tell(Status.OK, phase)
         else:
             self._reporter.tell(Status.DEGRADED, f"braking: {command.text}", {"reason": str(command.reason)})
         return command
 
-    def _believed(self, fresh: FloatArray | None) -> FloatArray:
-        return np.full(self._arm.count, np.nan) if fresh is None else fresh
-
-    def _learn_joints(self, now: float) -> None:
-        message = self._joints.newest()
-        if message is None:
+    def _learn_joints(self) -> None:
+        """Take the newest message that has all of the arm's joints."""
+        fault = ""
+        for message in reversed(self._joints.take()):
+            try:
+                self._reading = messages.joint_reading(message, self._arm.joint_names)
+            except FrameError as error:
+                fault = fault or str(error)
+                continue
+            self._heard = time.monotonic()
+            self._fault = self._untimely((message.log_time_ns - self._reading.stamp_ns) / NANOSECONDS)
             return
-        try:
-            self._position = position_at(now, message, self._arm.joint_names)
-        except FrameError as error:
-            self._fault = str(error)
-        else:
-            self._position_time, self._fault = now, ""
+        # Beside an arm that was just heard it is somebody else's.
+        if time.monotonic() - self._heard > JOINTS_FRESH:
+            self._fault = fault or self._fault
+
+    def _untimely(self, age: float) -> str:
+        """What is wrong with the joints' stamps, by their age at arrival, seconds; empty if nothing is."""
+        if -MAX_FUTURE <= age <= JOINTS_FRESH:
+            return ""
+        when = f"{age:.2f} s old" if age > 0 else f"{-age:.2f} s in the future"
+        return f"{self._joints.topic}: the stamp is {when}: the clocks of the arm and of this machine differ"
 
     def _see(self, controller: TracingController | None) -> None:
         """Hand on what came of the rope; without a controller it is forgotten."""
@@ -273,16 +304,17 @@ class KinematicSystem:
             self._basis.put(messages.time_reference(held, self._motion.stamp_ns))
 
 
-def position_at(now: float, message: RawMessage, names: tuple[str, ...]) -> FloatArray:
-    """Where the joints of a JointState are by now, if they went on as they did; just its positions if it is untimely.
+def position_at(now: float, reading: JointReading) -> FloatArray | None:
+    """Where the joints are by now if they went on as they did, (n,), rad; None if that is too long ago or to come.
 
-    Raises
-    ------
-    FrameError
-        If a joint is missing, or a position or a velocity is not finite.
+    Parameters
+    ----------
+    now : float
+        Seconds since 1970.
+    reading : JointReading
+        What the arm told last.
     """
-    position = messages.joint_values(message, names, "position")
-    age = now - stamp_and_frame(message)[0] / 1e9
-    if not 0 < age < JOINTS_FRESH or not messages.has_velocities(message):
-        return position
-    return position + age * messages.joint_values(message, names, "velocity")
+    age = now - reading.stamp_ns / NANOSECONDS
+    if not -MAX_FUTURE <= age <= JOINTS_FRESH:
+        return None
+    return reading.position + max(age, 0.0) * reading.velocity

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from ropetrace.errors import ConfigError, FrameError
 from ropetrace.recordings import ros_messages
-from ropetrace.recordings.pairing import missing_color
+from ropetrace.recordings.pairing import BUFFERED_BYTES, missing_color
 from ropetrace.recordings.ros_frames import COLOR_TOPIC, DEPTH_TOPIC
 from ropetrace.recordings.ros_messages import CAMERA, CLOUD, IMAGE, RawMessage
 from ropetrace.ros.graph import RosNode, Subscription, check_topic
@@ -16,6 +16,10 @@ from ropetrace.types import BadFrame, CloudFrame, Event, Intrinsics, RgbdFrame
 
 MOST_APART_NS = 20_000_000
 """Between a depth image and its colour, nanoseconds."""
+
+AT_ONCE_NS = 5_000_000
+"""Colour as near as this is taken at once; any other only when colour as late as the depth image has come, since a
+nearer one may follow. Nanoseconds."""
 
 LONGEST_WAIT_NS = 200_000_000
 """A depth image whose colour or camera has not come for this long is given up, nanoseconds."""
@@ -27,8 +31,11 @@ image, nanoseconds."""
 _KEPT = 4
 """Messages of each kind that wait to be looked at."""
 
+_BACKLOG = 8
+"""Images that wait while they are read in order; where more do, the newest is taken."""
+
 _WAITING = 32
-"""Images of each kind that wait for their partners at most."""
+"""Images of each kind that wait for their partners at most; no more than `BUFFERED_BYTES` of them, but one."""
 
 
 def camera_info_beside(image: str) -> str:
@@ -85,12 +92,7 @@ class LiveCamera:
     may_lack_color : bool
         Whether images go without their colour as long as none at all has come.
     in_order : bool
-        Give every frame, as far as its messages came: for whoever takes them at once.
-
-    Attributes
-    ----------
-    skipped : int
-        Images that were passed over for newer ones, of those that were looked at.
+        Give every frame, as far as its messages came and few wait: for whoever takes them at once.
     """
 
     def __init__(
@@ -101,7 +103,7 @@ class LiveCamera:
         may_lack_color: bool = False,
         in_order: bool = False,
     ) -> None:
-        self.skipped = 0
+        self._passed = 0
         self._in_order = in_order
         self._may_lack_color = may_lack_color
         self._first_depth_ns: int | None = None
@@ -118,13 +120,18 @@ class LiveCamera:
                 self._subscriptions.append(self._color)
         self._intrinsics: Intrinsics | None = None
         self._camera_fault = f"no camera_info yet on {topics.camera}"
-        self._depths: deque[tuple[int, RawMessage]] = deque(maxlen=_WAITING)
-        self._colors: deque[tuple[int, RawMessage]] = deque(maxlen=_WAITING)
+        self._depths: deque[tuple[int, RawMessage]] = deque()
+        self._colors: deque[tuple[int, RawMessage]] = deque()
 
     @property
     def name(self) -> str:
         """The topic without which there is no frame."""
         return self._subscriptions[0].topic
+
+    @property
+    def skipped(self) -> int:
+        """Depth images or clouds that were passed over for newer ones, or made room for them."""
+        return self._passed + self._subscriptions[0].displaced
 
     @property
     def waiting(self) -> int:
@@ -139,6 +146,9 @@ class LiveCamera:
         """The newest whole frame since the last call, or the next one; a `BadFrame` where one cannot be used."""
         if self._cloud is not None:
             self._clouds.extend(self._cloud.take())
+            while len(self._clouds) > _KEPT:
+                self._clouds.popleft()
+                self._passed += 1
             return _cloud_frame(self._clouds.popleft()) if self._clouds else None
         self._learn_camera()
         for read, kept in ((self._depth, self._depths), (self._color, self._colors)):
@@ -147,13 +157,16 @@ class LiveCamera:
                     kept.append((ros_messages.stamp_and_frame(message)[0], message))
                 except FrameError as error:
                     return Seen(BadFrame(message.log_time_ns, str(error)), "")
+        self._passed += _cut(self._depths)
+        _cut(self._colors)
         if not self._depths:
             return None
         if self._first_depth_ns is None:
             self._first_depth_ns = self._depths[0][1].log_time_ns
         if self._intrinsics is None:
             return self._given_up(self._camera_fault)
-        places = range(len(self._depths)) if self._in_order else range(len(self._depths) - 1, -1, -1)
+        count = len(self._depths)
+        places = range(count) if self._in_order and count <= _BACKLOG else range(count - 1, -1, -1)
         if self._color is None:
             return self._leave(places[0], None)
         if self._may_lack_color and not self._colors:
@@ -161,13 +174,11 @@ class LiveCamera:
             return None if patient else self._leave(places[0], None)
         self._may_lack_color = False
         for place in places:
-            color = self._color_of(self._depths[place][0])
-            if color is not None and abs(color[0] - self._depths[place][0]) <= MOST_APART_NS:
-                return self._leave(place, color[1])
-        color = self._color_of(self._depths[0][0])
-        return self._given_up(
-            missing_color(None if color is None else abs(color[0] - self._depths[0][0]), MOST_APART_NS)
-        )
+            color = self._color_of(*self._depths[place])
+            if color is not None:
+                return self._leave(place, color)
+        gap_ns = min((abs(stamp_ns - self._depths[0][0]) for stamp_ns, _ in self._colors), default=None)
+        return self._given_up(missing_color(gap_ns, MOST_APART_NS))
 
     def _learn_camera(self) -> None:
         message = self._camera.newest()
@@ -178,12 +189,18 @@ class LiveCamera:
         except FrameError as error:
             self._intrinsics, self._camera_fault = None, f"{message.topic}: {error}"
 
-    def _color_of(self, stamp_ns: int) -> tuple[int, RawMessage] | None:
-        return min(self._colors, key=lambda color: abs(color[0] - stamp_ns), default=None)
+    def _color_of(self, stamp_ns: int, depth: RawMessage) -> RawMessage | None:
+        """The nearest colour image, if it is near enough and no nearer one is to be expected."""
+        color = min(self._colors, key=lambda one: abs(one[0] - stamp_ns), default=None)
+        gap_ns = None if color is None else abs(color[0] - stamp_ns)
+        if color is None or gap_ns is None or gap_ns > MOST_APART_NS:
+            return None
+        expected = gap_ns > AT_ONCE_NS and all(one[0] < stamp_ns for one in self._colors)
+        return None if expected and not _overdue(depth) else color[1]
 
     def _leave(self, place: int, color: RawMessage | None) -> Seen:
         """The depth image at a place in the queue; those before it are skipped."""
-        self.skipped += place
+        self._passed += place
         for _ in range(place):
             self._depths.popleft()
         stamp_ns, depth = self._depths.popleft()
@@ -201,11 +218,26 @@ class LiveCamera:
     def _given_up(self, reason: str) -> Seen | None:
         """The oldest depth image, if it has waited for its partners for too long."""
         stamp_ns, depth = self._depths[0]
-        if len(self._depths) < _WAITING and time.time_ns() - depth.log_time_ns < LONGEST_WAIT_NS:
+        if len(self._depths) < _WAITING and not _overdue(depth):
             return None
         self._depths.popleft()
         told = "; ".join(filter(None, (reason, self.problem())))
         return Seen(BadFrame(stamp_ns, f"{depth.topic}: {told}"), ros_messages.stamp_and_frame(depth)[1])
+
+
+def _overdue(depth: RawMessage) -> bool:
+    """Whether a depth image has waited for its partners for as long as it may."""
+    return time.time_ns() - depth.log_time_ns >= LONGEST_WAIT_NS
+
+
+def _cut(waiting: deque[tuple[int, RawMessage]]) -> int:
+    """Drop the oldest of too many; how many."""
+    dropped = 0
+    size = sum(len(message.data) for _, message in waiting)
+    while len(waiting) > _WAITING or (len(waiting) > 1 and size > BUFFERED_BYTES):
+        size -= len(waiting.popleft()[1].data)
+        dropped += 1
+    return dropped
 
 
 def _cloud_frame(message: RawMessage) -> Seen:

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ropetrace.errors import FrameError
-from ropetrace.recordings.ros_messages import RawMessage, decoded
+from ropetrace.recordings.ros_messages import RawMessage, decoded, stamp_and_frame
 from ropetrace.results.ros_estimates import NANOSECONDS, make
-from ropetrace.results.ros_packed import unpack_path, unpack_trajectory
+from ropetrace.results.ros_packed import MOST_WAYPOINTS, unpack_path, unpack_trajectory
 from ropetrace.types import FloatArray, Motion, Waypoints
 
 POSES = "geometry_msgs/msg/PoseArray"
 JOINTS = "sensor_msgs/msg/JointState"
 NUMBERS = "std_msgs/msg/Float64MultiArray"
 TIME = "sensor_msgs/msg/TimeReference"
-
-MOST_WAYPOINTS = 100_000
-"""That are taken from a message: a rope of a kilometre."""
 
 
 def joint_state(held: Any, names: tuple[str, ...], position: FloatArray | None, velocity: FloatArray | None) -> Any:
@@ -97,15 +95,35 @@ def moving_waypoints(message: RawMessage) -> tuple[Waypoints, Motion] | None:
     return found, Motion(velocities, accelerations, unknown, unknown, unknown)
 
 
-def has_velocities(message: RawMessage) -> bool:
-    """Whether a sensor_msgs/JointState tells velocities: they may be left out.
+@dataclass(frozen=True, slots=True, eq=False)
+class JointReading:
+    """Where joints were, and how fast.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        When, nanoseconds since 1970.
+    position, velocity : (n,) float array
+        rad and rad/s.
+    """
+
+    stamp_ns: int
+    position: FloatArray
+    velocity: FloatArray
+
+
+def joint_reading(message: RawMessage, names: tuple[str, ...]) -> JointReading:
+    """The named joints of a sensor_msgs/JointState: at rest if it tells no velocities, of its arrival if no stamp.
 
     Raises
     ------
     FrameError
-        If it is damaged.
+        If it is damaged, a joint is missing, or a value is not finite.
     """
-    return len(decoded(message).velocity) > 0
+    body = decoded(message)
+    position = _of_joints(message.topic, body, names, "position")
+    velocity = _of_joints(message.topic, body, names, "velocity") if len(body.velocity) else np.zeros(len(names))
+    return JointReading(stamp_and_frame(message)[0] or message.log_time_ns, position, velocity)
 
 
 def joint_values(message: RawMessage, names: tuple[str, ...], of: str) -> FloatArray:
@@ -125,17 +143,20 @@ def joint_values(message: RawMessage, names: tuple[str, ...], of: str) -> FloatA
     FrameError
         If it is damaged, a joint is missing, or a value is not finite.
     """
-    body = decoded(message)
+    return _of_joints(message.topic, decoded(message), names, of)
+
+
+def _of_joints(topic: str, body: Any, names: tuple[str, ...], of: str) -> FloatArray:
     values = np.asarray(getattr(body, of), float)
     if len(values) != len(body.name):
-        raise FrameError(f"{message.topic}: {len(body.name)} joints, but {len(values)} of {of}")
+        raise FrameError(f"{topic}: {len(body.name)} joints, but {len(values)} of {of}")
     places = {name: place for place, name in enumerate(body.name)}
     missing = [name for name in names if name not in places]
     if missing:
-        raise FrameError(f"{message.topic}: the joint {missing[0]} is not in it: {', '.join(body.name[:16])}")
+        raise FrameError(f"{topic}: the joint {missing[0]} is not in it: {', '.join(body.name[:16])}")
     found = values[[places[name] for name in names]]
     if not np.isfinite(found).all():
-        raise FrameError(f"{message.topic}: the {of} of a joint is not finite")
+        raise FrameError(f"{topic}: the {of} of a joint is not finite")
     return found
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import threading
-import time
 from typing import Any
 
 from ropetrace.errors import MissingExtraError, RosError
@@ -60,7 +59,6 @@ class RclpyNode:
         executors = _module("rclpy.executors")
         self._arrived = threading.Event()
         self._reads: list[Subscription] = []
-        self._looked = time.monotonic()
         self._context = _module("rclpy.context").Context()
         try:
             rclpy.init(args=[], context=self._context, signal_handler_options=signals.SignalHandlerOptions.NO)
@@ -71,6 +69,7 @@ class RclpyNode:
         except Exception as error:
             self._context.try_shutdown()
             raise RosError(f"rclpy does not start: {one_line(error)}") from error
+        self._node.create_timer(LOOK_EVERY, self._look)
         self._executor.add_node(self._node)
         self._thread = threading.Thread(target=self._spin, args=(executors,), name="rclpy", daemon=True)
         self._thread.start()
@@ -123,10 +122,6 @@ class RclpyNode:
 
     def wait(self, seconds: float) -> None:
         """Wait until a message of any subscription has come since the last call, or for this long."""
-        if time.monotonic() - self._looked > LOOK_EVERY:
-            self._looked = time.monotonic()
-            for read in self._reads:
-                self._meet(read)
         self._arrived.wait(seconds)
         self._arrived.clear()
 
@@ -139,15 +134,16 @@ class RclpyNode:
                 found[topic] = publishers[0].topic_type
         return found
 
-    def _meet(self, read: Subscription) -> None:
+    def _look(self) -> None:
         """Learn who publishes something else under a name that is read."""
-        read.others = {
-            bytes(info.endpoint_gid).hex(): (
-                f"{read.topic} of node {info.node_name} is {info.topic_type}, expected {read.type}: not read"
-            )
-            for info in self._node.get_publishers_info_by_topic(read.topic)
-            if info.topic_type != read.type
-        }
+        for read in list(self._reads):
+            read.others = {
+                bytes(info.endpoint_gid).hex(): (
+                    f"{read.topic} of node {info.node_name} is {info.topic_type}, expected {read.type}: not read"
+                )
+                for info in self._node.get_publishers_info_by_topic(read.topic)
+                if info.topic_type != read.type
+            }
 
     def _spin(self, executors: Any) -> None:
         try:

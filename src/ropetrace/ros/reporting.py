@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-import sys
 import time
 
 from ropetrace.results.ros_estimates import DIAGNOSTICS, diagnostics, header
 from ropetrace.ros.graph import RosNode
+from ropetrace.ros.saying import say
 from ropetrace.types import Status
 
 EVERY = 1.0
@@ -36,7 +36,7 @@ class Reporter:
         if not changed and now - self._told < EVERY:
             return
         if changed:
-            print(f"{self._name}: {status}: {text}", file=sys.stderr, flush=True)
+            say(f"{self._name}: {status}: {text}")
         self._kind, self._told = kind, now
         held = header(time.time_ns(), "")
         self._publisher.put(diagnostics(held, f"ropetrace: {self._name}", status, text, values or {}))

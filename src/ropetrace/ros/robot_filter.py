@@ -6,7 +6,6 @@ from collections import deque
 
 from ropetrace.control.arm import Arm
 from ropetrace.errors import FrameError
-from ropetrace.recordings.ros_messages import RawMessage, stamp_and_frame
 from ropetrace.ros import messages
 from ropetrace.ros.graph import RosNode
 from ropetrace.self_filter import without_robot
@@ -17,7 +16,7 @@ MOST_APART_NS = 50_000_000
 """Joints that are further than this from an image's stamp do not tell where the arm was in it, nanoseconds."""
 
 _KEPT = 256
-"""Messages of joints that wait for their image: a quarter of a second at 1 kHz."""
+"""Readings of joints that wait for their image: a quarter of a second at 1 kHz."""
 
 
 class RobotFilter:
@@ -45,15 +44,15 @@ class RobotFilter:
         self._arm = arm
         self._camera_from_base = inverse_pose(base_from_camera)
         self._joints = node.subscription(joint_topic, messages.JOINTS, _KEPT)
-        self._recent: deque[tuple[int, RawMessage]] = deque(maxlen=_KEPT)
+        self._unusable = ""
+        self._recent: deque[messages.JointReading] = deque(maxlen=_KEPT)
 
     def clear(self, event: Event) -> Event:
         """The image without depth where the arm is; others as they are."""
+        self._learn_joints()
+        if not isinstance(event, RgbdFrame):
+            return event
         try:
-            for message in self._joints.take():
-                self._recent.append((stamp_and_frame(message)[0], message))
-            if not isinstance(event, RgbdFrame):
-                return event
             position = self._position(event.stamp_ns)
         except FrameError as error:
             self.fault = f"the arm is left in the image: {error}"
@@ -63,19 +62,27 @@ class RobotFilter:
         pose = self._camera_from_base
         return without_robot(event, moved(starts, pose), moved(ends, pose), radii)
 
+    def _learn_joints(self) -> None:
+        """Others than the arm may publish on the topic, such as a gripper."""
+        for message in self._joints.take():
+            try:
+                self._recent.append(messages.joint_reading(message, self._arm.joint_names))
+            except FrameError as error:
+                self._unusable = str(error)
+            else:
+                self._unusable = ""
+
     def _position(self, stamp_ns: int) -> FloatArray:
-        """The joints at a time, between the two messages beside it."""
-        near = [pair for pair in self._recent if abs(pair[0] - stamp_ns) <= MOST_APART_NS]
+        """The joints at a time, between the two readings beside it."""
+        near = [one for one in self._recent if abs(one.stamp_ns - stamp_ns) <= MOST_APART_NS]
         if not near:
-            problem = self._joints.problem() or f"nothing on {self._joints.topic} is of its time"
-            raise FrameError(problem)
-        before = max((pair for pair in near if pair[0] <= stamp_ns), key=lambda pair: pair[0], default=None)
-        after = min((pair for pair in near if pair[0] >= stamp_ns), key=lambda pair: pair[0], default=None)
-        names = self._arm.joint_names
-        if before is None or after is None or before[0] == after[0]:
+            topic = self._joints.topic
+            raise FrameError(self._joints.problem() or self._unusable or f"nothing on {topic} is of its time")
+        before = max((one for one in near if one.stamp_ns <= stamp_ns), key=lambda one: one.stamp_ns, default=None)
+        after = min((one for one in near if one.stamp_ns >= stamp_ns), key=lambda one: one.stamp_ns, default=None)
+        if before is None or after is None or before.stamp_ns == after.stamp_ns:
             nearest = before or after
             assert nearest is not None
-            return messages.joint_values(nearest[1], names, "position")
-        share = (stamp_ns - before[0]) / (after[0] - before[0])
-        earlier, later = (messages.joint_values(pair[1], names, "position") for pair in (before, after))
-        return earlier + share * (later - earlier)
+            return nearest.position
+        share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+        return before.position + share * (after.position - before.position)

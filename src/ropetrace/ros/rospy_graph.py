@@ -11,7 +11,6 @@ import importlib
 import logging
 import os
 import struct
-import sys
 import threading
 import xmlrpc.client
 from functools import cache
@@ -23,7 +22,8 @@ from ropetrace.errors import ConfigError, MissingExtraError, RosError
 from ropetrace.recordings import ros_messages
 from ropetrace.recordings.ros_messages import ros2_type
 from ropetrace.results.ros_estimates import typestore
-from ropetrace.ros.graph import Subscription, check_topic
+from ropetrace.ros.graph import LONGEST_BRAKING, Subscription, check_topic
+from ropetrace.ros.saying import say
 
 MASTER = "http://localhost:11311"
 """Where roscore listens, if ROS_MASTER_URI says nothing else."""
@@ -186,7 +186,7 @@ class RospyNode:
             if urlsplit(self._uri).hostname not in ("localhost", LOOPBACK, "::1"):
                 self._say(f"reached from this machine only, but roscore is at {self._uri}: set ROS_IP to open it")
         self._arrived = threading.Event()
-        self._closing = False
+        self._closing = threading.Event()
         self._changed = threading.Event()
         self._registrar: Any = None
         self._reads: list[Subscription] = []
@@ -203,13 +203,16 @@ class RospyNode:
 
     def close(self) -> None:
         """Leave the graph."""
-        self._closing = True
-        self._changed.set()
         if self._registrar is not None and not self._master_answers():
             # rospy would take leave of it, and wait for its answer without end.
             self._registrar.master_uri = None
             self._rospy.impl.registration.get_topic_manager().close_all()
+        self._closing.set()
+        self._changed.set()
         self._rospy.signal_shutdown("closed")
+        # If the master has told the node to end, it is rospy's thread that takes leave of it.
+        if self._rospy.core._shutdown_lock.acquire(timeout=LONGEST_ANSWER):
+            self._rospy.core._shutdown_lock.release()
         self._watch.join(LONGEST_ANSWER)
 
     def publisher(self, topic: str, type_name: str, depth: int = 5) -> RospyPublisher:
@@ -257,18 +260,20 @@ class RospyNode:
         return type("Raw", (self._rospy.AnyMsg,), held)
 
     def _say(self, text: str) -> None:
-        print(f"{self.name}: {text}", file=sys.stderr, flush=True)
+        say(f"{self.name}: {text}")
 
     def _told_to_end(self) -> None:
-        if not self._closing:
+        if not self._closing.is_set():
             self._say("told to end by the ROS master: rosnode kill, or another node of this name")
             _thread.interrupt_main()
+            # rospy closes every publisher as soon as this returns, and the arm may be braking.
+            self._closing.wait(LONGEST_BRAKING + 1)
 
     def _stay_known(self) -> None:
         """Join the graph when there is one, and see to it that the master knows this node until the end."""
         with _answering(self._uri) as master:
             missing_said = False
-            while not self._closing:
+            while not self._closing.is_set():
                 try:
                     _, _, (publishing, reading, _) = master.getSystemState(f"/{self.name}")
                 except _UNREACHABLE:
@@ -307,7 +312,7 @@ class RospyNode:
                 self.name, argv=[self.name], disable_signals=True, disable_rosout=True, disable_rostime=True
             )
         except rospy.ROSInitException:
-            if not self._closing:
+            if not self._closing.is_set():
                 raise
             return None
         listeners = rospy.impl.registration.get_registration_listeners()

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from ropetrace.ros.saying import say
 from ropetrace.terminal import BAD_INPUT
 
 RESTART_AFTER = 1.0
@@ -18,6 +19,9 @@ RESTART_AFTER = 1.0
 
 LONGEST_END = 10.0
 """A node that has not ended by itself after this long is killed, seconds."""
+
+ROUTER = "router"
+"""The node that ends last: what the others say while they end may go through it."""
 
 _SUPERVISOR = "ROPETRACE_SUPERVISOR"
 """The process with whose end a node ends, in its environment."""
@@ -66,13 +70,13 @@ def supervise(commands: dict[str, list[str]], should_stop: Callable[[], bool]) -
                     continue
                 if code == BAD_INPUT:
                     return BAD_INPUT
-                print(f"all: {name} ended with code {code}: it is started again", file=sys.stderr, flush=True)
+                say(f"all: {name} ended with code {code}: it is started again")
                 del running[name]
                 due[name] = time.monotonic() + RESTART_AFTER
             time.sleep(0.1)
         return 0
     finally:
-        _end(list(running.values()))
+        end_all(running)
 
 
 def end_with_supervisor() -> None:
@@ -89,9 +93,15 @@ def end_with_supervisor() -> None:
         raise SystemExit(128 + signal.SIGTERM)
 
 
+def end_all(running: dict[str, subprocess.Popen[bytes]]) -> None:
+    """End the nodes, by their names: all others first, and then the router."""
+    _end([process for name, process in running.items() if name != ROUTER])
+    _end([process for name, process in running.items() if name == ROUTER])
+
+
 def _end(processes: list[subprocess.Popen[bytes]]) -> None:
-    """Ask all to end, and wait; the first in the list last, since it may be the router."""
-    for process in reversed(processes):
+    """Ask all to end, and wait."""
+    for process in processes:
         process.terminate()
     end = time.monotonic() + LONGEST_END
     for process in processes:

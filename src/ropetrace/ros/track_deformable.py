@@ -121,7 +121,7 @@ def from_the_future(stamp_ns: int, now_ns: int) -> str:
     ahead = (stamp_ns - now_ns) / 1e9
     if ahead <= MAX_FUTURE:
         return ""
-    return f"the stamp is {ahead:.3f} s in the future: the clocks of the camera and of this machine differ"
+    return f"the stamp is {ahead:.3f} s in the future: the clocks of whoever sends it and of this machine differ"
 
 
 def with_reason(estimate: Estimate, reason: str) -> Estimate:

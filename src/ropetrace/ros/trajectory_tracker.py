@@ -25,6 +25,8 @@ LONGEST_PREDICTION = 0.5
 class TrajectoryTracker:
     """Follows the first rope's ``centerline``, and publishes its ``motion`` and its ``predicted`` path of this moment.
 
+    Of a path from the future nothing is published: the clocks of two machines differ.
+
     Parameters
     ----------
     node : RosNode
@@ -77,14 +79,14 @@ class TrajectoryTracker:
         waypoints = messages.waypoints(message)
         if not len(waypoints):
             return Status.LOST, "the rope is lost"
+        untimely = from_the_future(stamp_ns, time.time_ns())
+        if untimely:
+            return Status.DEGRADED, untimely
         motion = self._motion.update(stamp_ns, waypoints)
         if motion is None:
             return Status.DEGRADED, "the motion is not known yet"
         self._moving.put_packed(pack_trajectory(stamp_ns, frame_id, waypoints, motion))
         now_ns = time.time_ns()
-        untimely = from_the_future(stamp_ns, now_ns)
-        if untimely:
-            return Status.DEGRADED, untimely
         ahead = (now_ns - stamp_ns) / 1e9
         prediction = self._motion.predict(max(ahead, 0.0)) if ahead <= LONGEST_PREDICTION else None
         if prediction is None:
