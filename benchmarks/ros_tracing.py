@@ -173,12 +173,14 @@ class Process:
 
 
 @contextmanager
-def nodes(settings: Path) -> Iterator[list[Process]]:
+def nodes(settings: Path, shared_memory: bool) -> Iterator[list[Process]]:
     """The three nodes, running."""
     started = []
     try:
         for name in NODES:
             command = [sys.executable, "-m", "ropetrace", "node", name, "--config", str(settings), "--router", ROUTER]
+            if shared_memory:
+                command.append("--shared-memory")
             if name == "kinematic_system":
                 command += [f"--rate={CONTROL_RATE:g}", f"--response={RESPONSE:g}", f"--tool-turn={TOOL_TURN:g}"]
             started.append(Process(name, subprocess.Popen(command, stderr=subprocess.DEVNULL)))
@@ -190,10 +192,10 @@ def nodes(settings: Path) -> Iterator[list[Process]]:
             one.process.wait()
 
 
-def watch(frequency: float, condition: str, seconds: float, running: list[Process]) -> Wind:
+def watch(frequency: float, condition: str, seconds: float, running: list[Process], shared_memory: bool) -> Wind:
     """Let the arm trace in one wind for some time."""
     wind = Wind(frequency)
-    with ZenohNode("ropetrace_sim", Connection(router=ROUTER)) as node:
+    with ZenohNode("ropetrace_sim", Connection(router=ROUTER, shared_memory=shared_memory)) as node:
         cell = SimulatedCell(node, CellSettings(frequency, warm_up=WARM_UP, condition=condition))
         watcher = Watcher(node, cell, wind)
         end = time.monotonic() + seconds
@@ -216,6 +218,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--condition", choices=list(_CONDITIONS), default="30fps")
     parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--shared-memory", action="store_true")
     parser.add_argument("--frequencies", type=float, nargs="+", default=FREQUENCIES)
     options = parser.parse_args()
     each = options.minutes * 60 / len(options.frequencies)
@@ -224,15 +227,17 @@ def main() -> None:
         settings.write_text(cell_config().to_toml(), encoding="utf-8")
         router = open_router(ROUTER)
         try:
-            with nodes(settings) as running:
-                watch(0.0, options.condition, 15.0, running)  # the kernels are compiled, or come from the cache
+            with nodes(settings, options.shared_memory) as running:
+                watch(
+                    0.0, options.condition, 15.0, running, options.shared_memory
+                )  # the kernels are compiled, or come from the cache
                 for one in running:
                     one.memory.clear()
                 before = [one.cpu_seconds() for one in running]
                 began = time.monotonic()
                 winds = []
                 for frequency in options.frequencies:
-                    winds.append(watch(frequency, options.condition, each, running))
+                    winds.append(watch(frequency, options.condition, each, running, options.shared_memory))
                     print(_line(winds[-1]), flush=True)
                 took = time.monotonic() - began
                 used = [one.cpu_seconds() - start for one, start in zip(running, before, strict=True)]

@@ -260,7 +260,8 @@ def test_the_command_line_has_the_defaults_of_the_nodes() -> None:
     )
     assert ArmSettings() == ArmSettings(**asdict(Robot()), **asdict(Commands()))
     reach = Reach()
-    assert Connection() == Connection(reach.router, reach.mode, reach.listen, reach.multicast, 0, reach.humble)
+    told = (reach.router, reach.mode, reach.listen, reach.multicast, 0, reach.humble, reach.shared_memory)
+    assert Connection() == Connection(*told)
     assert Router().router == reach.router
 
 

@@ -574,36 +574,50 @@ def test_each_command_names_the_image_that_it_rests_on() -> None:
     assert ropes[-1] == drive.cell.ropes[-1]
 
 
-def reading(age: float, velocity: float | None) -> messages.JointReading:
+def reading(age: float) -> messages.JointReading:
     """Of joints at `START`, as a message that is this old tells it at a billion seconds; infinitely old: no stamp."""
     stamp_ns = 0 if np.isinf(age) else round((1e9 - age) * 1e9)
-    moving = None if velocity is None else np.full(7, velocity)
-    state = messages.joint_state(header(stamp_ns, ""), PANDA.joint_names, START, moving)
+    state = messages.joint_state(header(stamp_ns, ""), PANDA.joint_names, START, None)
     data = bytes(typestore().serialize_cdr(state, JOINTS))
     return messages.joint_reading(RawMessage("/joint_states", JOINTS, "cdr", 10**18, data), PANDA.joint_names)
 
 
+SENT = [(1e9 + step * 0.01, np.full(7, 0.5 * (step + 20) * 0.01)) for step in range(-20, 1)]
+"""0.5 rad/s for the last 0.2 s."""
+
+
 @pytest.mark.parametrize(
-    ("age", "velocity", "carried"),
-    [(0.02, 0.5, 0.01), (0.08, 0.5, 0.04), (0.02, None, 0), (-0.01, 0.5, 0), (np.inf, 0.5, 0)],
+    ("age", "response", "carried"),
+    [(0.02, 0.0, 0.01), (0.085, 0.0, 0.0425), (0.02, 0.005, 0.01), (-0.01, 0.0, 0), (np.inf, 0.0, 0)],
 )
-def test_joints_are_carried_on_from_their_stamp(age: float, velocity: float | None, carried: float) -> None:
-    """A message 20 ms old that says 0.5 rad/s is 10 mrad behind the arm; one without a stamp is of its arrival."""
-    position = position_at(1e9, reading(age, velocity))
+def test_joints_are_carried_on_from_their_stamp(age: float, response: float, carried: float) -> None:
+    """A message 20 ms old, of joints that were told 0.5 rad/s, is 10 mrad behind; with no stamp it is of its arrival."""
+    position = position_at(1e9, reading(age), SENT, response)
     assert position is not None
     np.testing.assert_allclose(position - START, carried, atol=1e-6)
 
 
 def test_joints_without_a_stamp_are_carried_on_from_their_arrival() -> None:
-    position = position_at(1e9 + 0.04, reading(np.inf, 0.5))
+    sent = [(at + 0.04, way) for at, way in SENT]
+    position = position_at(1e9 + 0.04, reading(np.inf), sent)
     assert position is not None
     np.testing.assert_allclose(position - START, 0.02, atol=1e-6)
+
+
+def test_joints_that_turned_round_are_not_carried_on_as_they_went() -> None:
+    """The arm went on for 50 ms after the message and then back for 40: by its own velocity it would be far away."""
+    ways = np.concatenate([np.arange(0, 11) * 0.02, 0.2 - np.arange(1, 9) * 0.02])
+    sent = [(1e9 - 0.09 + (step - 10) * 0.005 + 0.05, np.full(7, way)) for step, way in enumerate(ways)]
+    position = position_at(1e9, reading(0.09), sent)
+    assert position is not None
+    np.testing.assert_allclose(position - START, ways[-1] - ways[0], atol=1e-6)
+    assert np.array_equal(position_at(1e9, reading(0.09)), START)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("age", [5, 0.11, -0.03, -3600])
 def test_joints_of_another_time_say_nothing(age: float) -> None:
     """The last is a clock that was set back by an hour after the message came."""
-    assert position_at(1e9, reading(age, 0.5)) is None
+    assert position_at(1e9, reading(age), SENT) is None
 
 
 @pytest.mark.parametrize("in_order", [False, True])

@@ -25,7 +25,7 @@ from ropetrace.errors import ConfigError, RosError
 from ropetrace.recordings.ros_messages import CAMERA, CLOUD, IMAGE
 from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, make
 from ropetrace.ros import messages
-from ropetrace.ros.graph import check_topic
+from ropetrace.ros.graph import Publisher, check_topic
 from ropetrace.ros.zenoh_graph import (
     ZenohNode,
     attachment,
@@ -240,6 +240,52 @@ def test_a_reader_that_hangs_does_not_hold_up_the_publisher() -> None:
                     time.sleep(0.01)
                 assert np.median(took) < 0.02, "seconds"
                 assert max(took) < 0.25, "seconds"
+            finally:
+                reader.kill()
+
+
+COUNTING_READER = """
+import sys
+from pathlib import Path
+from ropetrace.ros.zenoh_session import Connection
+from ropetrace.ros.zenoh_graph import ZenohNode
+node = ZenohNode("reader", Connection(router=sys.argv[1]))
+read = node.subscription("/camera/depth", "sensor_msgs/msg/Image")
+for _ in sys.stdin:
+    while not read.take():
+        node.wait(0.1)
+    rows = Path("/proc/self/status").read_text().splitlines()
+    print(next(row for row in rows if row.startswith("VmRSS")), flush=True)
+"""
+
+
+def test_cameras_that_come_and_go_leave_no_memory_behind() -> None:
+    """By shared memory, Zenoh 1.10 would keep 16 MB of each."""
+    with routed() as connection:
+        reader = subprocess.Popen(
+            [sys.executable, "-c", COUNTING_READER, connection.router],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        with reader:
+            try:
+                assert reader.stdin is not None
+                assert reader.stdout is not None
+                output, sizes = reader.stdout, []
+                for _ in range(6):
+                    reader.stdin.write("\n")
+                    reader.stdin.flush()
+                    with ZenohNode("camera", connection) as camera:
+                        publisher = camera.publisher("/camera/depth", IMAGE)
+
+                        def read(publisher: Publisher = publisher) -> bool:
+                            publisher.put_packed(bytes(100_000))
+                            return bool(select.select([output], [], [], 0.02)[0])
+
+                        until(read)
+                    sizes.append(int(output.readline().split()[1]) / 1024)
+                assert sizes[-1] - sizes[1] < 20, f"MB: {sizes}"
             finally:
                 reader.kill()
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 
@@ -166,6 +169,8 @@ class KinematicSystem:
         self._reporter = Reporter(node)
         self._controller: TracingController | None = None
         self._reading: JointReading | None = None
+        kept = math.ceil((JOINTS_FRESH + LONGEST_RESPONSE) * self.settings.rate) + 2
+        self._sent: deque[tuple[float, FloatArray]] = deque(maxlen=kept)
         self._heard = -math.inf
         self._fault = ""
         self._astray = False
@@ -222,7 +227,8 @@ class KinematicSystem:
         silent = time.monotonic() - self._heard
         if self._controller is not None and silent > ARM_GONE and self._controller.guard.at_rest and not self._astray:
             self._controller = None
-        fresh = None if self._reading is None else position_at(now, self._reading)
+            self._sent.clear()
+        fresh = None if self._reading is None else position_at(now, self._reading, self._sent, self.settings.response)
         if self._controller is None and fresh is not None:
             self._motion.reset()
             self._controller = TracingController(
@@ -297,6 +303,11 @@ class KinematicSystem:
             self._reporter.tell(Status.DEGRADED, str(error))
 
     def _send(self, now: float, command: Command) -> None:
+        if self._sent and self._sent[-1][0] > now + self.period:
+            self._sent.clear()  # the clock was set back
+        if not self._sent:
+            self._sent.append((now, np.zeros(self._arm.count)))
+        self._sent.append((now + self.period, self._sent[-1][1] + self.period * command.velocity))
         self._velocities.put(messages.numbers(command.velocity))
         held = header(round(now * 1e9), "")
         self._commands.put(messages.joint_state(held, self._arm.joint_names, None, command.velocity))
@@ -304,8 +315,12 @@ class KinematicSystem:
             self._basis.put(messages.time_reference(held, self._motion.stamp_ns))
 
 
-def position_at(now: float, reading: JointReading) -> FloatArray | None:
-    """Where the joints are by now if they went on as they did, (n,), rad; None if that is too long ago or to come.
+def position_at(
+    now: float, reading: JointReading, sent: Sequence[tuple[float, FloatArray]] = (), response: float = 0.0
+) -> FloatArray | None:
+    """Where the joints are by now if they did what they were told, (n,), rad; None if the reading is not of now.
+
+    By their own velocity they would seem to run away wherever messages are lost while they turn round.
 
     Parameters
     ----------
@@ -313,8 +328,23 @@ def position_at(now: float, reading: JointReading) -> FloatArray | None:
         Seconds since 1970.
     reading : JointReading
         What the arm told last.
+    sent : sequence of (float, (n,) float array)
+        How far the joints had been sent in all by each time, ascending, rad.
+    response : float
+        How much later the joints do so, seconds.
     """
     age = now - reading.stamp_ns / NANOSECONDS
     if not -MAX_FUTURE <= age <= JOINTS_FRESH:
         return None
-    return reading.position + max(age, 0.0) * reading.velocity
+    if not sent or age <= 0:
+        return reading.position
+    return reading.position + _way_at(now - response, sent) - _way_at(now - response - age, sent)
+
+
+def _way_at(time: float, sent: Sequence[tuple[float, FloatArray]]) -> FloatArray:
+    """How far the joints had been sent by a time, between the two entries beside it."""
+    later = bisect_left(sent, time, key=itemgetter(0))
+    if not 0 < later < len(sent):
+        return sent[min(later, len(sent) - 1)][1]
+    (start, way), (end, further) = sent[later - 1], sent[later]
+    return way + (time - start) / (end - start) * (further - way)

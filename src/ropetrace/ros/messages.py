@@ -97,33 +97,30 @@ def moving_waypoints(message: RawMessage) -> tuple[Waypoints, Motion] | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointReading:
-    """Where joints were, and how fast.
+    """Where joints were.
 
     Parameters
     ----------
     stamp_ns : int
         When, nanoseconds since 1970.
-    position, velocity : (n,) float array
-        rad and rad/s.
+    position : (n,) float array
+        rad.
     """
 
     stamp_ns: int
     position: FloatArray
-    velocity: FloatArray
 
 
 def joint_reading(message: RawMessage, names: tuple[str, ...]) -> JointReading:
-    """The named joints of a sensor_msgs/JointState: at rest if it tells no velocities, of its arrival if no stamp.
+    """The named joints of a sensor_msgs/JointState; of its arrival if it has no stamp.
 
     Raises
     ------
     FrameError
-        If it is damaged, a joint is missing, or a value is not finite.
+        If it is damaged, a joint is missing, or a position is not finite.
     """
-    body = decoded(message)
-    position = _of_joints(message.topic, body, names, "position")
-    velocity = _of_joints(message.topic, body, names, "velocity") if len(body.velocity) else np.zeros(len(names))
-    return JointReading(stamp_and_frame(message)[0] or message.log_time_ns, position, velocity)
+    position = _of_joints(message.topic, decoded(message), names, "position")
+    return JointReading(stamp_and_frame(message)[0] or message.log_time_ns, position)
 
 
 def joint_values(message: RawMessage, names: tuple[str, ...], of: str) -> FloatArray:

@@ -39,6 +39,9 @@ class Connection:
         Look for others on the local network by UDP multicast too: this listens beyond this machine.
     domain : int
         ROS_DOMAIN_ID, 0 to 232.
+    shared_memory : bool
+        Hand on large messages to nodes on this machine by shared memory. Zenoh 1.10 keeps 16 MB of each node that has
+        ended.
     humble : bool
         Speak with Humble, which has no hashes of types.
 
@@ -54,6 +57,7 @@ class Connection:
     multicast: bool = False
     domain: int = 0
     humble: bool = False
+    shared_memory: bool = False
 
     def __post_init__(self) -> None:
         if self.mode not in ("peer", "client"):
@@ -79,7 +83,7 @@ def open_session(connection: Connection) -> Any:
         If Zenoh is not installed.
     """
     listen = [connection.listen] if connection.mode == "peer" else []
-    return _opened(connection.mode, [connection.router], listen, connection.multicast)
+    return _opened(connection.mode, [connection.router], listen, connection.multicast, connection.shared_memory)
 
 
 def open_router(endpoint: str = ROUTER) -> Any:
@@ -93,7 +97,7 @@ def open_router(endpoint: str = ROUTER) -> Any:
         If Zenoh is not installed.
     """
     _host_and_port("router", endpoint)
-    return _opened("router", [], [endpoint], False)
+    return _opened("router", [], [endpoint])
 
 
 def router_answers(endpoint: str = ROUTER) -> bool:
@@ -106,7 +110,9 @@ def router_answers(endpoint: str = ROUTER) -> bool:
     return True
 
 
-def _opened(mode: str, connect: list[str], listen: list[str], multicast: bool) -> Any:
+def _opened(
+    mode: str, connect: list[str], listen: list[str], multicast: bool = False, shared_memory: bool = False
+) -> Any:
     zenoh = import_extra("zenoh", "ros2")
     # As the default files of rmw_zenoh have it: the router tells the peers of each other, one of two connects.
     gossip = {
@@ -122,7 +128,10 @@ def _opened(mode: str, connect: list[str], listen: list[str], multicast: bool) -
         "scouting": {"multicast": {"enabled": multicast}, "gossip": gossip},
         "routing": {"router": {"peers_failover_brokering": False}},
         "timestamping": {"enabled": True},
-        "transport": {"link": {"tx": {"queue": {"congestion_control": {"drop": drop}}}}},
+        "transport": {
+            "link": {"tx": {"queue": {"congestion_control": {"drop": drop}}}},
+            "shared_memory": {"enabled": shared_memory},
+        },
     }
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
