@@ -591,7 +591,7 @@ SENT = [(1e9 + step * 0.01, np.full(7, 0.5 * (step + 20) * 0.01)) for step in ra
     [(0.02, 0.0, 0.01), (0.085, 0.0, 0.0425), (0.02, 0.005, 0.01), (-0.01, 0.0, 0), (np.inf, 0.0, 0)],
 )
 def test_joints_are_carried_on_from_their_stamp(age: float, response: float, carried: float) -> None:
-    """A message 20 ms old, of joints that were told 0.5 rad/s, is 10 mrad behind; with no stamp it is of its arrival."""
+    """A message 20 ms old, of joints told 0.5 rad/s, is 10 mrad behind; one without a stamp is of its arrival."""
     position = position_at(1e9, reading(age), SENT, response)
     assert position is not None
     np.testing.assert_allclose(position - START, carried, atol=1e-6)
