@@ -44,6 +44,11 @@ LIBRARY = "ropetrace "
 """What the header of every file that is written here tells, before the version."""
 
 
+@cache
+def _library() -> str:
+    return LIBRARY + version("ropetrace")
+
+
 class McapAppender:
     """Appends messages to a new MCAP file, a compressed chunk with a checksum a call.
 
@@ -73,7 +78,7 @@ class McapAppender:
         self._crc = 0
         self._broken = False
         self._closed = False
-        self._start = MAGIC + packed(Header("ros2", LIBRARY + version("ropetrace")))
+        self._start = MAGIC + packed(Header("ros2", _library()))
         for name, values in metadata.items():
             record = packed(Metadata(name=name, metadata=dict(values)))
             self._index.add_metadata(name, len(self._start), len(record))
