@@ -96,7 +96,7 @@ class Experiment(Generic[SomeCase, Settings, Result]):
             As `RunFolder.begin`.
         """
         table = asdict(cast(Any, settings))
-        times = {} if overwrite else folder.measured(table)
+        times = {} if overwrite else folder.settings.measured(table)
         if self.measure is not None:
             for condition in conditions:
                 if condition.name not in times:

@@ -121,6 +121,11 @@ class RunFolder(Generic[SomeRun, Result]):
         Of `ropetrace`, whose runs they are.
     inner : str
         The folder in it that has their files.
+
+    Attributes
+    ----------
+    settings : SettingsFile
+        What all of its runs depend on.
     """
 
     def __init__(self, path: Path, result: type[Result], command: str, inner: str) -> None:
@@ -128,24 +133,7 @@ class RunFolder(Generic[SomeRun, Result]):
         self._result = result
         self._arrays = [item.name for item in fields(cast(Any, result))]
         self._files = path / inner
-        self._settings = SettingsFile(path, command)
-
-    def measured(self, settings: Mapping[str, Any]) -> dict[str, float]:
-        """What was measured before the runs that are in the folder; nothing if there are none.
-
-        Parameters
-        ----------
-        settings : mapping
-            Those of the runs that are to join them.
-
-        Raises
-        ------
-        ConfigError
-            If the runs have other settings.
-        OutputError
-            If the folder holds something else.
-        """
-        return self._settings.measured(settings)
+        self.settings = SettingsFile(path, command)
 
     def begin(
         self, settings: Mapping[str, Any], measured: Mapping[str, float] | None = None, overwrite: bool = False
@@ -157,7 +145,7 @@ class RunFolder(Generic[SomeRun, Result]):
         settings : mapping
             What all runs depend on: texts, numbers, sequences of them, and mappings; what is None is left out.
         measured : mapping, optional
-            Compute times by their names, simulated seconds: see `measured`.
+            Compute times by their names, simulated seconds: see `SettingsFile.measured`.
         overwrite : bool
             Begin anew, whatever was run before.
 
@@ -169,13 +157,13 @@ class RunFolder(Generic[SomeRun, Result]):
             If it holds something else, or cannot be written.
         """
         if not overwrite:
-            self.measured(settings)
+            self.settings.measured(settings)
         with writing(self.path):
             self._files.mkdir(parents=True, exist_ok=True)
             if overwrite:
                 for file in self._files.glob("*.npz"):
                     file.unlink()
-        self._settings.write(settings, measured)
+        self.settings.write(settings, measured)
 
     def run_path(self, run: SomeRun) -> Path:
         """The file of a run."""

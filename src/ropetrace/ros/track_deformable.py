@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 MAX_FUTURE = 0.02
 """A stamp further ahead of this machine's clock than this is told, seconds."""
 
-SILENCE = 1.0
-"""A camera that has sent nothing for this long is told, seconds."""
-
 
 class TrackDeformable:
     """Tracks what a camera sends, and publishes for each rope ``centerline``, ``poses`` and ``status``.
@@ -60,7 +57,6 @@ class TrackDeformable:
         self._outputs: dict[int, dict[str, Publisher]] = {}
         self._output(0)
         self._frames = 0
-        self._last = time.monotonic()
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Track until told to stop."""
@@ -73,16 +69,14 @@ class TrackDeformable:
         seen = self._camera.take()
         problem = self._camera.problem()
         if seen is not None:
-            self._last = time.monotonic()
+            self._reporter.heard()
             self._frames += 1
             if self._robot is not None:
                 seen = replace(seen, event=self._robot.clear(seen.event))
                 problem = "; ".join(filter(None, [problem, self._robot.fault]))
             self._publish(seen, problem)
             return
-        silent = time.monotonic() - self._last
-        if silent > SILENCE:
-            self._reporter.tell(Status.LOST, problem or f"nothing came on {self._camera.name} for {silent:.1f} s")
+        self._reporter.tell_silence(self._camera.name, problem)
 
     def _publish(self, seen: Seen, problem: str) -> None:
         estimates = estimates_of(seen.event, self._tracker, sorted(self._outputs))

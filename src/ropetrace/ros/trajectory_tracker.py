@@ -15,7 +15,7 @@ from ropetrace.results.ros_packed import pack_path, pack_trajectory
 from ropetrace.ros import messages
 from ropetrace.ros.graph import RosNode
 from ropetrace.ros.reporting import Reporter
-from ropetrace.ros.track_deformable import SILENCE, from_the_future
+from ropetrace.ros.track_deformable import from_the_future
 from ropetrace.types import Status
 
 LONGEST_PREDICTION = 0.5
@@ -50,7 +50,6 @@ class TrajectoryTracker:
         self._moving = node.publisher(topic_of(0, "motion"), TRAJECTORY)
         self._predicted = node.publisher(topic_of(0, "predicted"), PATH)
         self._reporter = Reporter(node)
-        self._last = time.monotonic()
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Follow until told to stop."""
@@ -62,16 +61,13 @@ class TrajectoryTracker:
         """Follow every path that has come."""
         paths = self._paths.take()
         for message in paths:
-            self._last = time.monotonic()
+            self._reporter.heard()
             try:
                 self._reporter.tell(*self._follow(message))
             except FrameError as error:
                 self._reporter.tell(Status.LOST, str(error))
-        silent = time.monotonic() - self._last
-        if not paths and silent > SILENCE:
-            self._reporter.tell(
-                Status.LOST, self._paths.problem() or f"nothing came on {self._paths.topic} for {silent:.1f} s"
-            )
+        if not paths:
+            self._reporter.tell_silence(self._paths.topic, self._paths.problem())
 
     def _follow(self, message: RawMessage) -> tuple[Status, str]:
         """Take one path; how it went."""

@@ -162,10 +162,6 @@ class ZenohNode:
         """Leave the graph."""
         self._session.close()
 
-    def has_router(self) -> bool:
-        """Whether a router is connected."""
-        return bool(self._session.info.routers_zid())
-
     def publisher(self, topic: str, type_name: str, depth: int = 5) -> ZenohPublisher:
         """Publish messages of a type.
 
