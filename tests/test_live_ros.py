@@ -68,11 +68,19 @@ def first(recording: LiveRecording, count: int = 3) -> list[Event]:
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
-    monkeypatch.setattr(live_camera, "COLOR_PATIENCE_NS", 300_000_000)
+    monkeypatch.setattr(live_camera, "COLOR_PATIENCE", 0.3)
+    monkeypatch.setattr(ros_camera, "PRESENT_SECONDS", 30.0)
+
+
+def complaint(recording: LiveRecording) -> str:
+    """Why there are no frames."""
+    with pytest.raises(RecordingError) as caught:
+        first(recording)
+    return str(caught.value)
 
 
 def test_images_with_their_colour_and_their_true_age(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_camera, "COLOR_PATIENCE_NS", 10_000_000_000)
+    monkeypatch.setattr(live_camera, "COLOR_PATIENCE", 10.0)
     with routed() as connection, publishing(connection, rgbd):
         recording = opened(connection)
         # A busy machine may lose one.
@@ -137,20 +145,22 @@ def test_no_router() -> None:
 def test_a_graph_without_this_camera_names_those_that_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ros_camera, "PRESENT_SECONDS", 1.0)
     with routed() as connection:
+
+        def told(words: str) -> bool:
+            """A busy machine may not see all that is published within the second."""
+            return words in complaint(opened(connection))
+
         with pytest.raises(RecordingError, match=f"nothing came on {DEPTH_TOPIC} .* there are no images and no clouds"):
             first(opened(connection))
         with publishing(connection, gray, under="/left"), publishing(connection, cloud):
-            with pytest.raises(RecordingError, match="choose with --depth-topic or --cloud-topic") as caught:
-                first(opened(connection))
-            assert f"{CLOUD_TOPIC} (PointCloud2), /left{DEPTH_TOPIC} (Image)" in str(caught.value)
+            there = f"there are {CLOUD_TOPIC} (PointCloud2), /left{DEPTH_TOPIC} (Image)"
+            until(lambda: told(f"{there}: choose with --depth-topic or --cloud-topic"))
         with ZenohNode("camera", connection) as silent:
             silent.publisher(DEPTH_TOPIC, IMAGE)
-            with pytest.raises(RecordingError, match="it is published, but silent"):
-                first(opened(connection))
+            until(lambda: told("it is published, but silent"))
         with ZenohNode("camera", connection) as wrong:
             wrong.publisher(DEPTH_TOPIC, CAMERA)
-            with pytest.raises(RecordingError, match="CameraInfo, expected sensor_msgs/msg/Image: not read"):
-                first(opened(connection))
+            until(lambda: told("CameraInfo, expected sensor_msgs/msg/Image: not read"))
 
 
 def test_a_camera_of_another_domain_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,17 +172,18 @@ def test_a_camera_of_another_domain_is_not_there(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_camera_that_goes_and_returns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ros_camera, "PRESENT_SECONDS", 1.0)
     monkeypatch.setattr("ropetrace.live.stream.RESTART_SECONDS", 1.0)
     monkeypatch.setattr("ropetrace.live.stream.RETRY_SECONDS", 0.1)
     with routed() as connection:
         recording = opened(connection)
-        recording._silence = 0.2
+        recording._silence, recording._give_up = 0.2, 300.0
         frames = recording.frames()
         with publishing(connection, rgbd):
             assert isinstance(next(frames), RgbdFrame)
         # Away for so long that it is looked for anew.
+        monkeypatch.setattr(ros_camera, "PRESENT_SECONDS", 1.0)
         until(lambda: "nothing came on" in getattr(next(frames), "reason", ""))
+        monkeypatch.setattr(ros_camera, "PRESENT_SECONDS", 30.0)
         with publishing(connection, rgbd):
             until(lambda: isinstance(next(frames), RgbdFrame))
         frames.close()  # type: ignore[attr-defined]
@@ -226,7 +237,7 @@ def test_a_fast_camera_without_its_partners_is_told_and_not_silent() -> None:
     reasons = {getattr(event, "reason", "") for event in seen_for(camera, node, info)}
     assert reasons == {f"{DEPTH_TOPIC}: no camera_info yet on {info}"}
     reasons = {getattr(event, "reason", "") for event in seen_for(camera, node, COLOR_TOPIC)}
-    assert any("no colour image within 20 ms" in reason for reason in reasons)
+    assert any("no colour image within " in reason for reason in reasons)
     assert isinstance(seen_for(camera, node)[-1], RgbdFrame)
 
 
@@ -249,8 +260,11 @@ def shown(number: int) -> RgbdFrame:
 
 
 @pytest.mark.parametrize("in_order", [False, True])
-def test_colour_is_that_of_the_depth_image_and_not_of_the_one_before(in_order: bool) -> None:
+def test_colour_is_that_of_the_depth_image_and_not_of_the_one_before(
+    in_order: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Depth comes first, and once a depth image is lost: what is nearest by then is 16 ms away, and near enough."""
+    monkeypatch.setattr(live_camera, "LONGEST_WAIT", 1e6)
     node = LocalNode()
     camera = LiveCamera(node, CameraTopics(), wants_color=True, in_order=in_order)
     pairs = []
@@ -265,21 +279,17 @@ def test_colour_is_that_of_the_depth_image_and_not_of_the_one_before(in_order: b
     assert pairs == [(number, number) for number in range(12) if number != 4]
 
 
-def test_colour_that_is_not_the_nearest_serves_where_no_other_comes() -> None:
+def test_colour_that_is_not_the_nearest_serves_where_no_other_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_camera, "LONGEST_WAIT", 1e6)
     node = LocalNode()
     camera = LiveCamera(node, CameraTopics(), wants_color=True)
     node.show(shown(0), DEPTH_TOPIC)
     node.show(shown(1), COLOR_TOPIC)
     assert camera.take() is None
-    got: list[Event] = []
-
-    def came() -> bool:
-        seen = camera.take()
-        got.extend([] if seen is None else [seen.event])
-        return bool(got)
-
-    until(came)
-    assert isinstance(got[0], RgbdFrame)
+    monkeypatch.setattr(live_camera, "LONGEST_WAIT", 0.0)
+    seen = camera.take()
+    assert seen is not None
+    assert isinstance(seen.event, RgbdFrame)
 
 
 def test_what_nobody_takes_in_order_is_counted_and_not_kept() -> None:
@@ -320,8 +330,26 @@ def test_images_in_order_do_not_stay_behind() -> None:
     assert len(taken) + camera.skipped == 60
 
 
+@pytest.mark.parametrize("in_order", [False, True])
+def test_the_colour_of_the_frame_beside_is_not_taken_for_a_lost_one(in_order: bool) -> None:
+    """At 60 frames a second they are 17 ms apart, in which a rope may go 3 cm."""
+    node = LocalNode()
+    camera = LiveCamera(node, CameraTopics(), wants_color=True, in_order=in_order)
+    start, taken = time.time_ns(), []
+    for number in range(40):
+        frame = replace(shown(number), stamp_ns=start + number * 16_666_667)
+        node.show(frame, *([COLOR_TOPIC] if number % 10 == 9 else []))
+        while (seen := camera.take()) is not None:
+            if isinstance(seen.event, RgbdFrame) and number > 9:
+                assert seen.event.color is not None
+                taken.append((seen.event.stamp_ns - start) // 16_666_667)
+                assert seen.event.color[0, 0, 0] == taken[-1]
+    assert taken == [number for number in range(10, 40) if number % 10 != 9]
+
+
 def test_images_that_wait_have_bounded_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_camera, "BUFFERED_BYTES", 1000)
+    monkeypatch.setattr(live_camera, "LONGEST_WAIT", 1e6)
     node = LocalNode()
     camera = LiveCamera(node, CameraTopics(), wants_color=True, in_order=True)
     for number in range(20):
@@ -337,16 +365,15 @@ def test_what_a_live_source_loses_is_told(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(camera, "_graph", replace(camera._graph, join=lambda: node))
     recording = LiveRecording("ros2:", camera)
 
-    def burst() -> None:
+    def overrun() -> bool:
         for _ in range(10):
             node.show(cloud())
+        return camera.lost >= 5
 
     with ros_rig.publishing(lambda: node, cloud):
         frames = recording.frames()
         next(frames)
-        burst()
-        until(lambda: camera.lost >= 5)
-        next(frames)
+        until(overrun)
         frames.close()  # type: ignore[attr-defined]
     assert any(line.startswith("lost      ") and "faster than they were read" in line for line in recording.lines())
 
@@ -368,18 +395,20 @@ while True:
 
 ROS1_READER = """
 import json
+from ropetrace.live import ros_camera
 from ropetrace.recordings import open_recording
 from ropetrace.errors import RecordingError
 try:
     next(open_recording("ros1:", depth_topic="/nope/image_raw").frames())
 except RecordingError as error:
     print(json.dumps(str(error)), flush=True)
+ros_camera.PRESENT_SECONDS = 30
 for _ in range(2):
     recording = open_recording("ros1:")
     for frame in recording.frames(limit=3):
         last = frame
     print(json.dumps([type(last).__name__, int(last.depth[0, 0]), last.intrinsics.fx, last.color is None,
-                      recording.clock_lines()]), flush=True)
+                      [line for line in recording.clock_lines() if not line.startswith("lost")]]), flush=True)
 """
 
 
@@ -393,7 +422,7 @@ def test_ros1(tmp_path: Path) -> None:
         core.start()
         with core.debian(ROS1_CAMERA):
             core.came("/camera/aligned_depth_to_color/camera_info")
-            done = subprocess.run(command, env=core.our_env, capture_output=True, text=True, timeout=90, check=True)
+            done = subprocess.run(command, env=core.our_env, capture_output=True, text=True, timeout=300, check=True)
     finally:
         core.stop()
     missing, *frames = map(json.loads, done.stdout.splitlines())

@@ -422,6 +422,19 @@ def test_pairing_keeps_its_bound() -> None:
     assert "there is none" in str(paired([("depth", 100)], 10)[100])
 
 
+def test_pairing_does_not_take_the_colour_of_the_frame_beside() -> None:
+    step = 17
+    rows = [(stream, number * step) for number in range(20) for stream in ("color", "depth")]
+    found = paired([row for row in rows if row != ("color", 15 * step)], 20)
+    assert isinstance(found.pop(15 * step), str)
+    assert all(depth == color for depth, color in found.items())
+    # Depth that is faster than colour has none nearer.
+    slow = [(stream, stamp) for stamp in range(0, 500, 10) for stream in ("color", "depth")]
+    assert not any(
+        isinstance(one, str) for one in paired([r for r in slow if r[0] == "depth" or r[1] % 30 == 0], 20).values()
+    )
+
+
 def test_pairing_never_waits_for_ever() -> None:
     pairing = Pairing[int, int](1)
     left = [row for stamp in range(1000) for row in pairing.add_depth(stamp, stamp, 1)]
@@ -453,8 +466,11 @@ def test_pairing_equals_a_search_over_everything(colors: list[int], delay: int, 
     depths = list(range(0, 500, 33))
     arrivals = sorted([(time, "color", time) for time in colors] + [(time + delay, "depth", time) for time in depths])
     found = paired([(stream, stamp) for _, stream, stamp in arrivals], gap)
+    steps = np.diff(sorted(colors))
+    beside = 3 * steps.min() // 4 if len(steps) >= 4 else gap
     for depth in depths:
         best = min(abs(color - depth) for color in colors)
         color = found[depth]
-        assert isinstance(color, str) == (best > gap)
+        assert isinstance(color, str) or best <= gap
+        assert not isinstance(color, str) or best > min(gap, beside)
         assert isinstance(color, str) or abs(color - depth) == best

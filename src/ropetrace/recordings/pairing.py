@@ -5,6 +5,8 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
+from statistics import median_low
 from typing import Generic, TypeVar
 
 BUFFERED = 64
@@ -12,6 +14,9 @@ BUFFERED = 64
 
 BUFFERED_BYTES = 256 * 2**20
 """Bytes of each stream that wait for their partner at most."""
+
+_STEPS = 9
+"""Steps between colour images whose median is the usual one; half of them must be known."""
 
 Depth = TypeVar("Depth")
 Color = TypeVar("Color")
@@ -27,6 +32,43 @@ def nearest(stamps_ns: Sequence[int], stamp_ns: int) -> int | None:
     if right == len(stamps_ns) or stamp_ns - stamps_ns[right - 1] <= stamps_ns[right] - stamp_ns:
         return right - 1
     return right
+
+
+class ColorReach:
+    """How far from a depth image its colour may be: not as far as that of the frame beside it, when its own is lost.
+
+    Parameters
+    ----------
+    max_gap_ns : int
+        However far apart colour images are, nanoseconds.
+    """
+
+    def __init__(self, max_gap_ns: int) -> None:
+        self._max_gap_ns = max_gap_ns
+        self._last_ns: int | None = None
+        self._steps: deque[int] = deque(maxlen=_STEPS)
+
+    def learn(self, stamp_ns: int) -> None:
+        """A colour image has come."""
+        if self._last_ns is not None and stamp_ns > self._last_ns:
+            self._steps.append(stamp_ns - self._last_ns)
+        self._last_ns = stamp_ns
+
+    @property
+    def reach_ns(self) -> int:
+        """By the colour images that came last, nanoseconds."""
+        return reach_of(self._steps, self._max_gap_ns)
+
+
+def reach_of(steps_ns: Sequence[int], max_gap_ns: int) -> int:
+    """Three quarters of the usual time between colour images, but `max_gap_ns` at most or where few are known."""
+    return min(max_gap_ns, 3 * median_low(steps_ns) // 4) if len(steps_ns) >= _STEPS // 2 else max_gap_ns
+
+
+def reach_around(stamps_ns: Sequence[int], index: int, max_gap_ns: int) -> int:
+    """`reach_of` the steps about one place in a rising sequence."""
+    near = stamps_ns[max(index - _STEPS // 2, 0) : index + _STEPS // 2 + 2]
+    return reach_of([later - one for one, later in pairwise(near) if later > one], max_gap_ns)
 
 
 def missing_color(gap_ns: int | None, max_gap_ns: int) -> str:
@@ -45,11 +87,12 @@ class Pairing(Generic[Depth, Color]):
     Parameters
     ----------
     max_gap_ns : int
-        Stamps farther apart than this are not paired, nanoseconds.
+        Stamps farther apart than this are not paired, nor those beyond `ColorReach`, nanoseconds.
     """
 
     def __init__(self, max_gap_ns: int) -> None:
         self._max_gap_ns = max_gap_ns
+        self._reach = ColorReach(max_gap_ns)
         self._depths: deque[tuple[int, Depth, int]] = deque()
         self._colors: deque[tuple[int, Color, int]] = deque()
         self._last_depth_ns: int | None = None
@@ -60,6 +103,7 @@ class Pairing(Generic[Depth, Color]):
             yield from self.finish()
             self._colors.clear()
         self._colors.append((stamp_ns, color, size))
+        self._reach.learn(stamp_ns)
         yield from self._leaving()
         while _overfull(self._colors):
             self._colors.popleft()
@@ -92,8 +136,9 @@ class Pairing(Generic[Depth, Color]):
         # Of images that repeat a stamp the last belongs to the depth image that has just come.
         best = min(reversed(self._colors), key=lambda color: (abs(color[0] - stamp), color[0]), default=None)
         gap = None if best is None else abs(best[0] - stamp)
-        if best is None or gap is None or gap > self._max_gap_ns:
-            return stamp, depth, missing_color(gap, self._max_gap_ns)
+        reach = self._reach.reach_ns
+        if best is None or gap is None or gap > reach:
+            return stamp, depth, missing_color(gap, reach)
         return stamp, depth, best[1]
 
 

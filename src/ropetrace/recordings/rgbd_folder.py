@@ -33,7 +33,7 @@ from ropetrace.recordings.base import (
     read_camera,
     read_file,
 )
-from ropetrace.recordings.pairing import missing_color, nearest
+from ropetrace.recordings.pairing import missing_color, nearest, reach_around
 from ropetrace.types import BadFrame, Event, Intrinsics, RgbdFrame
 
 _STAMP = re.compile(r"([+-]?)([0-9]{1,10})(?:\.([0-9]{0,30}))?")
@@ -116,9 +116,14 @@ class RgbdFolder:
         if self._color is None:
             return None
         index = nearest(self._color_stamps, stamp_ns)
-        gap = None if index is None else abs(self._color_stamps[index] - stamp_ns)
-        if index is None or gap is None or gap > self._max_gap_ns:
-            raise FrameError(missing_color(gap, self._max_gap_ns))
+        if index is None:
+            raise FrameError(missing_color(None, self._max_gap_ns))
+        gap, reach = (
+            abs(self._color_stamps[index] - stamp_ns),
+            reach_around(self._color_stamps, index, self._max_gap_ns),
+        )
+        if gap > reach:
+            raise FrameError(missing_color(gap, reach))
         row = self._color[index]
         try:
             return images.decode_color(read_file(row.file))

@@ -8,25 +8,25 @@ from dataclasses import dataclass
 
 from ropetrace.errors import ConfigError, FrameError
 from ropetrace.recordings import ros_messages
-from ropetrace.recordings.pairing import BUFFERED_BYTES, missing_color
+from ropetrace.recordings.pairing import BUFFERED_BYTES, ColorReach, missing_color
 from ropetrace.recordings.ros_frames import COLOR_TOPIC, DEPTH_TOPIC
 from ropetrace.recordings.ros_messages import CAMERA, CLOUD, IMAGE, RawMessage
 from ropetrace.ros.graph import RosNode, Subscription, check_topic
 from ropetrace.types import BadFrame, CloudFrame, Event, Intrinsics, RgbdFrame
 
 MOST_APART_NS = 20_000_000
-"""Between a depth image and its colour, nanoseconds."""
+"""Between a depth image and its colour, and no more than `ColorReach`, nanoseconds."""
 
 AT_ONCE_NS = 5_000_000
 """Colour as near as this is taken at once; any other only when colour as late as the depth image has come, since a
 nearer one may follow. Nanoseconds."""
 
-LONGEST_WAIT_NS = 200_000_000
-"""A depth image whose colour or camera has not come for this long is given up, nanoseconds."""
+LONGEST_WAIT = 0.2
+"""A depth image whose colour or camera has not come for this long is given up, seconds."""
 
-COLOR_PATIENCE_NS = 2_000_000_000
+COLOR_PATIENCE = 2.0
 """Where images may lack their colour, they are taken without when none has come for this long after the first depth
-image, nanoseconds."""
+image, seconds."""
 
 _KEPT = 4
 """Messages of each kind that wait to be looked at."""
@@ -71,6 +71,20 @@ class CameraTopics:
 
 
 @dataclass(frozen=True, slots=True)
+class _Image:
+    """One that waits for its partner; since when, by a clock that nobody sets."""
+
+    stamp_ns: int
+    message: RawMessage
+    since: float
+
+    @property
+    def overdue(self) -> bool:
+        """Whether it has waited for as long as it may."""
+        return time.monotonic() - self.since >= LONGEST_WAIT
+
+
+@dataclass(frozen=True, slots=True)
 class Seen:
     """A frame, and the frame of reference that its message names."""
 
@@ -106,7 +120,7 @@ class LiveCamera:
         self._passed = 0
         self._in_order = in_order
         self._may_lack_color = may_lack_color
-        self._first_depth_ns: int | None = None
+        self._first_depth: float | None = None
         self._cloud = None if topics.cloud is None else node.subscription(topics.cloud, CLOUD, _KEPT if in_order else 1)
         self._clouds: deque[RawMessage] = deque()
         self._color: Subscription | None = None
@@ -120,8 +134,9 @@ class LiveCamera:
                 self._subscriptions.append(self._color)
         self._intrinsics: Intrinsics | None = None
         self._camera_fault = f"no camera_info yet on {topics.camera}"
-        self._depths: deque[tuple[int, RawMessage]] = deque()
-        self._colors: deque[tuple[int, RawMessage]] = deque()
+        self._depths: deque[_Image] = deque()
+        self._colors: deque[_Image] = deque()
+        self._reach = ColorReach(MOST_APART_NS)
 
     @property
     def name(self) -> str:
@@ -151,18 +166,15 @@ class LiveCamera:
                 self._passed += 1
             return _cloud_frame(self._clouds.popleft()) if self._clouds else None
         self._learn_camera()
-        for read, kept in ((self._depth, self._depths), (self._color, self._colors)):
-            for message in [] if read is None else read.take():
-                try:
-                    kept.append((ros_messages.stamp_and_frame(message)[0], message))
-                except FrameError as error:
-                    return Seen(BadFrame(message.log_time_ns, str(error)), "")
-        self._passed += _cut(self._depths)
-        _cut(self._colors)
+        fault = self._learn_images(self._depth, self._depths)
+        if self._color is not None:
+            fault = self._learn_images(self._color, self._colors) or fault
+        if fault is not None:
+            return fault
         if not self._depths:
             return None
-        if self._first_depth_ns is None:
-            self._first_depth_ns = self._depths[0][1].log_time_ns
+        if self._first_depth is None:
+            self._first_depth = self._depths[0].since
         if self._intrinsics is None:
             return self._given_up(self._camera_fault)
         count = len(self._depths)
@@ -170,15 +182,15 @@ class LiveCamera:
         if self._color is None:
             return self._leave(places[0], None)
         if self._may_lack_color and not self._colors:
-            patient = time.time_ns() - self._first_depth_ns < COLOR_PATIENCE_NS
+            patient = time.monotonic() - self._first_depth < COLOR_PATIENCE
             return None if patient else self._leave(places[0], None)
         self._may_lack_color = False
         for place in places:
-            color = self._color_of(*self._depths[place])
+            color = self._color_of(self._depths[place])
             if color is not None:
                 return self._leave(place, color)
-        gap_ns = min((abs(stamp_ns - self._depths[0][0]) for stamp_ns, _ in self._colors), default=None)
-        return self._given_up(missing_color(gap_ns, MOST_APART_NS))
+        gap_ns = min((abs(one.stamp_ns - self._depths[0].stamp_ns) for one in self._colors), default=None)
+        return self._given_up(missing_color(gap_ns, self._reach.reach_ns))
 
     def _learn_camera(self) -> None:
         message = self._camera.newest()
@@ -189,22 +201,40 @@ class LiveCamera:
         except FrameError as error:
             self._intrinsics, self._camera_fault = None, f"{message.topic}: {error}"
 
-    def _color_of(self, stamp_ns: int, depth: RawMessage) -> RawMessage | None:
+    def _learn_images(self, read: Subscription, kept: deque[_Image]) -> Seen | None:
+        """Take the images that have come; the last that says nothing of when it was taken."""
+        fault = None
+        for message in read.take():
+            try:
+                stamp_ns = ros_messages.stamp_and_frame(message)[0]
+            except FrameError as error:
+                fault = Seen(BadFrame(message.log_time_ns, str(error)), "")
+                continue
+            kept.append(_Image(stamp_ns, message, time.monotonic()))
+            if kept is self._colors:
+                self._reach.learn(stamp_ns)
+        dropped = _cut(kept)
+        if kept is self._depths:
+            self._passed += dropped
+        return fault
+
+    def _color_of(self, depth: _Image) -> RawMessage | None:
         """The nearest colour image, if it is near enough and no nearer one is to be expected."""
-        color = min(self._colors, key=lambda one: abs(one[0] - stamp_ns), default=None)
-        gap_ns = None if color is None else abs(color[0] - stamp_ns)
-        if color is None or gap_ns is None or gap_ns > MOST_APART_NS:
+        color = min(self._colors, key=lambda one: abs(one.stamp_ns - depth.stamp_ns), default=None)
+        gap_ns = None if color is None else abs(color.stamp_ns - depth.stamp_ns)
+        if color is None or gap_ns is None or gap_ns > self._reach.reach_ns:
             return None
-        expected = gap_ns > AT_ONCE_NS and all(one[0] < stamp_ns for one in self._colors)
-        return None if expected and not _overdue(depth) else color[1]
+        expected = gap_ns > AT_ONCE_NS and all(one.stamp_ns < depth.stamp_ns for one in self._colors)
+        return None if expected and not depth.overdue else color.message
 
     def _leave(self, place: int, color: RawMessage | None) -> Seen:
         """The depth image at a place in the queue; those before it are skipped."""
         self._passed += place
         for _ in range(place):
             self._depths.popleft()
-        stamp_ns, depth = self._depths.popleft()
-        while self._colors and self._colors[0][0] <= stamp_ns:
+        taken = self._depths.popleft()
+        stamp_ns, depth = taken.stamp_ns, taken.message
+        while self._colors and self._colors[0].stamp_ns <= stamp_ns:
             self._colors.popleft()
         frame_id = ros_messages.stamp_and_frame(depth)[1]
         assert self._intrinsics is not None
@@ -217,25 +247,20 @@ class LiveCamera:
 
     def _given_up(self, reason: str) -> Seen | None:
         """The oldest depth image, if it has waited for its partners for too long."""
-        stamp_ns, depth = self._depths[0]
-        if len(self._depths) < _WAITING and not _overdue(depth):
+        oldest = self._depths[0]
+        if len(self._depths) < _WAITING and not oldest.overdue:
             return None
         self._depths.popleft()
-        told = "; ".join(filter(None, (reason, self.problem())))
-        return Seen(BadFrame(stamp_ns, f"{depth.topic}: {told}"), ros_messages.stamp_and_frame(depth)[1])
+        told = f"{oldest.message.topic}: " + "; ".join(filter(None, (reason, self.problem())))
+        return Seen(BadFrame(oldest.stamp_ns, told), ros_messages.stamp_and_frame(oldest.message)[1])
 
 
-def _overdue(depth: RawMessage) -> bool:
-    """Whether a depth image has waited for its partners for as long as it may."""
-    return time.time_ns() - depth.log_time_ns >= LONGEST_WAIT_NS
-
-
-def _cut(waiting: deque[tuple[int, RawMessage]]) -> int:
+def _cut(waiting: deque[_Image]) -> int:
     """Drop the oldest of too many; how many."""
     dropped = 0
-    size = sum(len(message.data) for _, message in waiting)
+    size = sum(len(one.message.data) for one in waiting)
     while len(waiting) > _WAITING or (len(waiting) > 1 and size > BUFFERED_BYTES):
-        size -= len(waiting.popleft()[1].data)
+        size -= len(waiting.popleft().message.data)
         dropped += 1
     return dropped
 
