@@ -86,16 +86,16 @@ class Stream:
     def _run(self) -> None:
         try:
             self._camera.connect()
-            while not self._stopping.is_set():
+            self._fetch_while_there()
+            while self._has_returned():
                 self._fetch_while_there()
-                self._wait_for_return()
         except Exception as error:
             with self._changed:
                 self._failure = error
                 self._changed.notify()
 
     def _fetch_while_there(self) -> None:
-        """Until the camera gives no frames any more."""
+        """Until the camera gives no frames any more, or is to stop; then let it go."""
         since = time.monotonic()
         try:
             while not self._stopping.is_set() and time.monotonic() - since < RESTART_SECONDS:
@@ -108,7 +108,8 @@ class Stream:
         finally:
             self._camera.disconnect()
 
-    def _wait_for_return(self) -> None:
+    def _has_returned(self) -> bool:
+        """Connect as soon as the camera is there again; False when told to stop before."""
         while not self._stopping.wait(RETRY_SECONDS):
             try:
                 self._camera.connect()
@@ -116,7 +117,8 @@ class Stream:
                 self.trouble = str(error)
             else:
                 self.trouble = ""
-                return
+                return True
+        return False
 
     def _put(self, capture: Capture) -> None:
         if self._on_event is not None:
