@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import secrets
 import socket
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from ropetrace.recordings.ros_frames import frame_messages
@@ -17,12 +18,17 @@ from ropetrace.ros.graph import RosNode, Subscription
 from ropetrace.ros.zenoh_session import Connection, open_router
 from ropetrace.types import Frame
 
+STARTED = 300.0
+"""Whatever a test waits for is there within this, seconds: nodes compile their kernels, and the machine may be busy."""
+
 
 def free_port() -> int:
-    """A port of this machine at which nothing listens."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A port of this machine at which nothing listens, and that Linux gives to nobody who asks for any port."""
+    while True:
+        port = 10_000 + secrets.randbelow(22_000)
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 def free_endpoint() -> str:
@@ -115,7 +121,7 @@ class LocalNode:
                 self.publisher(message.topic, message.type).put_packed(bytes(message.data))
 
 
-def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
+def until(condition: Callable[[], object], seconds: float = STARTED) -> None:
     """Wait for a condition."""
     end = time.monotonic() + seconds
     while not condition():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -27,13 +29,14 @@ from ropetrace.recordings.ros_frames import CLOUD_TOPIC, COLOR_TOPIC, DEPTH_TOPI
 from ropetrace.recordings.ros_messages import CLOUD, IMAGE, RawMessage, decoded, stamp_and_frame
 from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, TRAJECTORY, header, make, typestore
 from ropetrace.ros import messages
+from ropetrace.ros.commanded import CommandedMotion
 from ropetrace.ros.graph import Publisher, RosNode, Subscription
-from ropetrace.ros.kinematic_system import ARM_GONE, ArmSettings, KinematicSystem, ReceivedMotion, position_at
+from ropetrace.ros.kinematic_system import ARM_GONE, ArmSettings, KinematicSystem, ReceivedMotion
 from ropetrace.ros.live_camera import CameraTopics, LiveCamera
-from ropetrace.ros.messages import JOINTS, NUMBERS, POSES, TIME
+from ropetrace.ros.messages import JOINTS, NUMBERS, POSES, TIME, JointReading
 from ropetrace.ros.reporting import Reporter
 from ropetrace.ros.robot_filter import RobotFilter
-from ropetrace.ros.simulated_cell import ARM_AWAY, CellSettings, SimulatedCell, cell_config
+from ropetrace.ros.simulated_cell import ARM_AWAY, COMMAND_LASTS, CellSettings, SimulatedCell, cell_config
 from ropetrace.ros.track_deformable import TrackDeformable
 from ropetrace.ros.trajectory_tracker import TrajectoryTracker
 from ropetrace.ros.zenoh_graph import ZenohNode
@@ -365,6 +368,7 @@ class Drive:
         self._told = self.node.subscription("/diagnostics", DIAGNOSTICS, depth=1000)
         self.cell = ArmAndRope(self.node)
         self.system = KinematicSystem(self.node, cell_config().world_from_camera(), ArmSettings(rate=50))
+        self._velocity, self._told_at = np.zeros(7), time.time()
 
     def joints(self) -> None:
         self.cell.send_joints()
@@ -373,12 +377,14 @@ class Drive:
         self.cell.send_rope()
 
     def step(self, *send: Callable[[], None]) -> Command | None:
-        """Send, and make one step; what was told by it."""
+        """Send, and make one step; what was told by it. The arm holds each command until the next."""
+        now = time.time()
+        self.cell.position = self.cell.position + (now - self._told_at) * self._velocity
         for one in send:
             one()
-        command = self.system.step(time.time())
-        if command is not None:
-            self.cell.position = self.cell.position + self.system.period * command.velocity
+        command = self.system.step(now)
+        self._told_at = now
+        self._velocity = np.zeros(7) if command is None else command.velocity
         time.sleep(self.system.period)
         return command
 
@@ -423,7 +429,12 @@ def test_the_arm_moves_only_while_all_is_known() -> None:
     drive.until(fast, joints, rope)
 
     # So do frames in which it is lost.
-    drive.until(rests("the rope is lost"), joints, *[cell.send_lost] * 4)
+    def rests_for_it() -> bool:
+        """Within five steps: later it is old."""
+        drive.until(fast, joints, rope)
+        return any(rests("the rope is lost")(drive.step(joints, *[cell.send_lost] * 4)) for _ in range(5))
+
+    until(rests_for_it)
     drive.until(fast, joints, rope)
 
     # An arm that is not heard any more is braked; when it is back elsewhere, all begins anew from there.
@@ -450,16 +461,18 @@ def test_motion_from_the_future_stops_the_arm_and_true_motion_moves_it_again() -
     drive.until(fast, drive.joints, drive.rope)
 
 
-@pytest.mark.parametrize(("ahead", "said"), [(-1.0, "1.00 s old"), (1.0, "1.00 s in the future")])
+@pytest.mark.parametrize(
+    ("ahead", "said"), [(-1000.0, r"1\d\d\d\.\d\d s old"), (1000.0, r"(1000|9\d\d)\.\d\d s in the future")]
+)
 def test_joints_of_another_time_stop_the_arm(ahead: float, said: str) -> None:
     drive = Drive()
     drive.steps(0.2, lambda: drive.cell.send_joints(ahead), drive.rope)
     assert drive.velocities.take() == []
-    words = f"/joint_states: the stamp is {said}: the clocks of the arm and of this machine differ"
-    assert any(words in told for told in drive.said())
+    words = re.compile(f"/joint_states: the stamp is {said}: the clocks of the arm and of this machine differ")
+    assert any(map(words.search, drive.said()))
     drive.until(fast, drive.joints, drive.rope)
     drive.until(rests(""), lambda: drive.cell.send_joints(ahead), drive.rope)
-    until(lambda: drive.step(lambda: drive.cell.send_joints(ahead)) and any(words in told for told in drive.said()))
+    until(lambda: drive.step(lambda: drive.cell.send_joints(ahead)) and any(map(words.search, drive.said())))
     drive.until(fast, drive.joints, drive.rope)
 
 
@@ -516,6 +529,41 @@ def test_a_node_whose_stderr_is_closed_goes_on(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("sys.stderr", Closed())
     Reporter(node).tell(Status.OK, "tracing")
     assert [decoded(message).status[0].message for message in heard.take()] == ["tracing"]
+
+
+def test_a_change_is_told_again_soon_and_what_flickers_fills_no_log(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    node, clock = LocalNode(), [100.0]
+    heard = node.subscription("/diagnostics", DIAGNOSTICS, depth=1000)
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    reporter = Reporter(node)
+
+    def told(texts: list[str]) -> tuple[list[str], list[str]]:
+        """One each 10 ms; on the topic and on stderr."""
+        for text in texts:
+            reporter.tell(Status.OK, text)
+            clock[0] += 0.01
+        said = capsys.readouterr().err.splitlines()
+        return [decoded(message).status[0].message for message in heard.take()], said
+
+    assert told(["tracing"] * 50)[0] == ["tracing"] * 2
+    assert told(["done"] * 100)[0] == ["done"] * 2, "at once and after 0.1 s, of which one may be lost"
+    assert told(["done"] * 200)[0] == ["done"] * 2
+    flickers, said = told(["tracing", "lost"] * 500)
+    assert len(flickers) == 1000
+    assert 18 <= len(said) <= 22, "each once a second"
+    assert told(["lost"] * 200)[1][-1:] == [], "what stays was said last"
+    assert told(["tracing"] * 5 + ["lost"] * 200)[1][-1] == "local: ok: lost"
+
+
+def test_damaged_paths_beside_a_sound_motion_do_not_stop_the_arm() -> None:
+    drive = Drive()
+    paths = drive.node.publisher("/ropetrace/centerline", PATH)
+    drive.until(fast, drive.joints, drive.rope)
+    for _ in range(20):
+        drive.step(drive.joints, drive.rope, lambda: paths.put_packed(b"damaged"))
+    drive.until(fast, drive.joints, drive.rope, lambda: paths.put_packed(b"damaged"))
 
 
 def test_a_joint_that_is_missing_is_told() -> None:
@@ -582,8 +630,12 @@ def reading(age: float) -> messages.JointReading:
     return messages.joint_reading(RawMessage("/joint_states", JOINTS, "cdr", 10**18, data), PANDA.joint_names)
 
 
-SENT = [(1e9 + step * 0.01, np.full(7, 0.5 * (step + 20) * 0.01)) for step in range(-20, 1)]
-"""0.5 rad/s for the last 0.2 s."""
+def going(until: float = 1e9, response: float = 0.0) -> CommandedMotion:
+    """Joints that are told 0.5 rad/s each 10 ms for the last 0.2 s."""
+    told = CommandedMotion(100, response)
+    for step in range(-20, 1):
+        told.command(until + step * 0.01, np.full(7, 0.5))
+    return told
 
 
 @pytest.mark.parametrize(
@@ -592,55 +644,65 @@ SENT = [(1e9 + step * 0.01, np.full(7, 0.5 * (step + 20) * 0.01)) for step in ra
 )
 def test_joints_are_carried_on_from_their_stamp(age: float, response: float, carried: float) -> None:
     """A message 20 ms old, of joints told 0.5 rad/s, is 10 mrad behind; one without a stamp is of its arrival."""
-    position = position_at(1e9, reading(age), SENT, response)
+    position = going(response=response).carried_on(1e9, reading(age))
     assert position is not None
     np.testing.assert_allclose(position - START, carried, atol=1e-6)
 
 
 def test_joints_without_a_stamp_are_carried_on_from_their_arrival() -> None:
-    sent = [(at + 0.04, way) for at, way in SENT]
-    position = position_at(1e9 + 0.04, reading(np.inf), sent)
+    position = going(1e9 + 0.04).carried_on(1e9 + 0.04, reading(np.inf))
     assert position is not None
     np.testing.assert_allclose(position - START, 0.02, atol=1e-6)
 
 
 def test_joints_that_turned_round_are_not_carried_on_as_they_went() -> None:
     """The arm went on for 50 ms after the message and then back for 40: by its own velocity it would be far away."""
-    ways = np.concatenate([np.arange(0, 11) * 0.02, 0.2 - np.arange(1, 9) * 0.02])
-    sent = [(1e9 - 0.09 + (step - 10) * 0.005 + 0.05, np.full(7, way)) for step, way in enumerate(ways)]
-    position = position_at(1e9, reading(0.09), sent)
+    told = CommandedMotion(200)
+    assert np.array_equal(told.carried_on(1e9, reading(0.09)), START)  # type: ignore[arg-type]
+    for step in range(-28, 0):
+        told.command(1e9 + step * 0.005, np.full(7, 4.0 if step < -8 else -4.0))
+    position = told.carried_on(1e9, reading(0.09))
     assert position is not None
-    np.testing.assert_allclose(position - START, ways[-1] - ways[0], atol=1e-6)
-    assert np.array_equal(position_at(1e9, reading(0.09)), START)  # type: ignore[arg-type]
+    np.testing.assert_allclose(position - START, 0.05 * 4 - 0.04 * 4, atol=1e-6)
+
+
+def test_a_command_lasts_until_the_next_however_late_it_comes() -> None:
+    told = going()
+    told.command(1e9 + 0.06, np.zeros(7))
+    position = told.carried_on(1e9 + 0.08, JointReading(10**18 - 10_000_000, START))
+    assert position is not None
+    np.testing.assert_allclose(position - START, 0.07 * 0.5, atol=1e-6)
+    # A clock that is set back begins anew.
+    told.command(1e9 - 100, np.zeros(7))
+    assert np.array_equal(told.carried_on(1e9 - 99.99, JointReading(10**18 - 100 * 10**9, START)), START)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("age", [5, 0.11, -0.03, -3600])
 def test_joints_of_another_time_say_nothing(age: float) -> None:
     """The last is a clock that was set back by an hour after the message came."""
-    assert position_at(1e9, reading(age), SENT) is None
+    assert going().carried_on(1e9, reading(age)) is None
 
 
 @pytest.mark.parametrize("in_order", [False, True])
 def test_the_newest_frame_or_every_one(scene: tuple[RgbdFrame, FloatArray], in_order: bool) -> None:
     with graph() as (node, beside):
         camera, sender = LiveCamera(node, CameraTopics(), True, in_order=in_order), Sender(beside)
+        expected = 3 if in_order else 1
 
-        def seen_one() -> bool:
-            sender.send(scene[0])
-            return camera.take() is not None
+        def as_many_come_of_three() -> bool:
+            """As far as the graph knows them both, and loses none."""
+            while camera.take() is not None:
+                """Those of before."""
+            for _ in range(3):
+                sender.send(scene[0])
+            time.sleep(0.2)
+            taken = []
+            while (seen := camera.take()) is not None:
+                taken.append(seen.event.stamp_ns)
+            assert sorted(taken) == taken
+            return len(taken) == expected
 
-        until(seen_one)
-        time.sleep(0.1)
-        while camera.take() is not None:
-            """Those of the beginning."""
-        for _ in range(3):
-            sender.send(scene[0])
-        time.sleep(0.2)
-        taken = []
-        while (seen := camera.take()) is not None:
-            taken.append(seen.event.stamp_ns)
-        assert len(taken) == (3 if in_order else 1)
-        assert sorted(taken) == taken
+        until(as_many_come_of_three)
 
 
 def test_the_arm_is_taken_out_of_the_image() -> None:
@@ -711,6 +773,41 @@ def test_an_arm_that_is_put_back_says_nothing_and_stands_still() -> None:
         assert not any(put_back[0] < now < put_back[0] + ARM_AWAY for now in times)
         assert any(now >= put_back[0] + ARM_AWAY for now in times)
     assert decoded(images.take()[-1]).width == 1280
+
+
+def test_a_simulation_that_stalls_makes_up_for_it_by_the_commands_of_each_moment() -> None:
+    """A real arm does not wait for a slow camera."""
+    node = LocalNode()
+    cell = SimulatedCell(node)
+    commands = node.publisher("/ropetrace/joint_commands", JOINTS)
+    told: list[tuple[float, float]] = []
+    started, stalled, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def command() -> None:
+        assert started.wait(60)
+        for step in range(100):
+            speed = 0.3 if step < 50 else 0.0
+            velocity = np.full(7, speed)
+            told.append((time.time(), speed))
+            commands.put(messages.joint_state(header(time.time_ns(), ""), PANDA.joint_names, None, velocity))
+            if step == 30:
+                stalled.set()
+            time.sleep(0.01)
+        ended.set()
+
+    def tick(now: float) -> None:
+        if now > ARM_AWAY + 0.1:
+            started.set()
+        if stalled.is_set():
+            stalled.clear()
+            time.sleep(0.3)
+
+    thread = threading.Thread(target=command)
+    thread.start()
+    cell.run(ended.is_set, tick)
+    thread.join()
+    gone = sum(speed * min(after - at, COMMAND_LASTS) for (at, speed), (after, _) in itertools.pairwise(told))
+    np.testing.assert_allclose(cell.moving.position - START, gone, atol=0.012)
 
 
 def test_a_cell_that_cannot_be() -> None:

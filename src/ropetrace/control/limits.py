@@ -37,6 +37,9 @@ _SETTLED = 0.5
 _STILL = 1e-6
 """Speed towards a wall, m/s, that is round-off."""
 
+_CLOCK_ROUNDING = 1e-9
+"""By which sums of periods differ, s."""
+
 _MOST_RAMP = 1000
 """Periods in which an acceleration can be taken back, at most: more is a wrong unit."""
 
@@ -133,11 +136,14 @@ class MotionGuard:
     asks for nothing outside `velocity_bounds`. A wish that stays the same is reached without overshoot, except that one
     met at once with an acceleration above ``jerk dt`` is passed while that is taken back.
 
-    The guard keeps the state that it has commanded. Its position is the sum of the velocities times the period; the
-    measured position enters in three ways. A difference above `GuardOptions.max_tracking_error` is a fault. Room to
-    each end of a joint's range is counted from the worse of commanded and measured position; noise can thus only make
-    the guard more careful, and the commanded position respects the limits on its own account. And a motion that starts
-    after half a second of rest starts from the measured position, so that periods that were missed do not add up.
+    The guard keeps the state that it has commanded. Its position is the sum of the velocities, each times the time
+    until the next step, since the robot holds a command until another comes. Whether it did so in a gap above
+    `GuardOptions.max_gap` nobody knows: of the places where the joint can be by then, the one nearest to the measured
+    position counts. Else the measured position enters in three ways. A difference above
+    `GuardOptions.max_tracking_error` is a fault. Room to each end of a joint's range is counted from the worse of
+    commanded and measured position; noise can thus only make the guard more careful, and the commanded position of
+    steps in time respects the limits on its own account. And a motion that starts after half a second of rest starts
+    from the measured position, so that small differences do not add up.
 
     When braking, each joint stops by itself, as fast as its limits of acceleration and jerk permit. With
     ``jerk dt >= 2 acceleration`` (an arm of Franka's at up to 250 Hz) no joint's speed ever grows meanwhile; at higher
@@ -282,6 +288,7 @@ class MotionGuard:
         Command
         """
         where, wrong = self._vector("measured position", measured)
+        self._learn_hold(finite_number(now), where)
         wish, vain = (None, "") if hold is not None else self._vector("desired velocity", desired)
         reason, text = self._objection(now, where, wrong, vain, stamp, hold)
         braking = reason is not None or where is None or wish is None
@@ -298,6 +305,19 @@ class MotionGuard:
         self._rest = 0 if moving else self._rest + 1
         return Command(self._state[1].copy(), reason, text)
 
+    def _learn_hold(self, now: float | None, where: FloatArray | None) -> None:
+        """The last command was counted as one period long: it lasted until now."""
+        if now is None or self._last is None or now <= self._last:
+            return
+        late = now - self._last - self.period
+        if abs(late) < _CLOCK_ROUNDING:
+            return
+        way = late * self._state[1]
+        if late >= (self.options.max_gap - 1) * self.period:
+            away = np.zeros(self._count) if where is None else where - self._state[0]
+            way = np.clip(away, np.minimum(way, 0), np.maximum(way, 0))
+        self._state[0] += way
+
     def _objection(
         self, now: float, where: FloatArray | None, wrong: str, vain: str, stamp: float, hold: str | None
     ) -> tuple[Reason | None, str]:
@@ -311,7 +331,7 @@ class MotionGuard:
             if not errors[joint] <= self.options.max_tracking_error:
                 self._fault = (
                     f"joint {joint + 1} is at {where[joint]:.4g} rad, but was sent to {self._state[0, joint]:.4g} rad: "
-                    f"more than {self.options.max_tracking_error:g} rad apart; reset() to go on"
+                    f"more than {self.options.max_tracking_error:g} rad apart"
                 )
         if self._fault:
             return Reason.TRACKING, self._fault

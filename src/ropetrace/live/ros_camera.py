@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING
 from ropetrace.errors import RecordingError, RosError, import_extra
 from ropetrace.live.camera import CameraGoneError, Capture
 from ropetrace.recordings.ros_messages import CLOUD, IMAGE, ros2_type
-from ropetrace.ros.graph import RosNode
+from ropetrace.ros.graph import MAX_FUTURE, RosNode
 from ropetrace.ros.joining import domain_of_environment
 from ropetrace.ros.live_camera import CameraTopics, LiveCamera, camera_info_beside
-from ropetrace.ros.track_deformable import MAX_FUTURE
 from ropetrace.ros.zenoh_session import ROUTER, START_ROUTER, Connection, router_answers
 
 if TYPE_CHECKING:

@@ -12,6 +12,9 @@ from typing import Any, Protocol, Self
 from ropetrace.errors import ConfigError
 from ropetrace.recordings.ros_messages import MAX_MESSAGE_BYTES, RawMessage
 
+MAX_FUTURE = 0.02
+"""A stamp further ahead of this machine's clock than this is told, seconds."""
+
 LONGEST_BRAKING = 2.0
 """For which a node that is told to end goes on until what it moves is at rest, seconds."""
 

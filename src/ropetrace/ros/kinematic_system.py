@@ -5,11 +5,8 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from bisect import bisect_left
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from operator import itemgetter
 
 import numpy as np
 
@@ -22,26 +19,20 @@ from ropetrace.motion.filters import transition
 from ropetrace.recordings.ros_messages import stamp_and_frame
 from ropetrace.results.ros_estimates import NANOSECONDS, PATH, TRAJECTORY, header, topic_of
 from ropetrace.ros import messages
-from ropetrace.ros.graph import LONGEST_BRAKING, RosNode, check_topic
+from ropetrace.ros.commanded import JOINTS_FRESH, LONGEST_RESPONSE, CommandedMotion
+from ropetrace.ros.graph import LONGEST_BRAKING, MAX_FUTURE, RosNode, check_topic
 from ropetrace.ros.messages import JOINTS, NUMBERS, TIME, JointReading
 from ropetrace.ros.reporting import Reporter
-from ropetrace.ros.track_deformable import MAX_FUTURE
 from ropetrace.types import Estimate, FloatArray, Motion, Status, Waypoints
 
 MARGIN = 0.01
 """The guard keeps this far from the ends of the joints' ranges, rad."""
-
-JOINTS_FRESH = 0.1
-"""The arm brakes while its joints' newest positions are older than this, seconds."""
 
 ARM_GONE = 1.0
 """An arm that has said nothing for this long is gone, seconds; when it is back, all begins from where it stands."""
 
 JOINTS_KEPT = 16
 """Messages on the joints' topic between two steps: others than the arm may publish there, such as a gripper."""
-
-LONGEST_RESPONSE = 0.05
-"""Of an arm, seconds."""
 
 REST_TOLD = 0.2
 """For which an arm at rest is still told so at the end, seconds: a message may be lost."""
@@ -169,8 +160,7 @@ class KinematicSystem:
         self._reporter = Reporter(node)
         self._controller: TracingController | None = None
         self._reading: JointReading | None = None
-        kept = math.ceil((JOINTS_FRESH + LONGEST_RESPONSE) * self.settings.rate) + 2
-        self._sent: deque[tuple[float, FloatArray]] = deque(maxlen=kept)
+        self._commanded = CommandedMotion(self.settings.rate, self.settings.response)
         self._heard = -math.inf
         self._fault = ""
         self._astray = False
@@ -227,8 +217,8 @@ class KinematicSystem:
         silent = time.monotonic() - self._heard
         if self._controller is not None and silent > ARM_GONE and self._controller.guard.at_rest and not self._astray:
             self._controller = None
-            self._sent.clear()
-        fresh = None if self._reading is None else position_at(now, self._reading, self._sent, self.settings.response)
+            self._commanded.forget()
+        fresh = None if self._reading is None else self._commanded.carried_on(now, self._reading)
         if self._controller is None and fresh is not None:
             self._motion.reset()
             self._controller = TracingController(
@@ -257,6 +247,9 @@ class KinematicSystem:
             self._reporter.tell(Status.LOST, f"braking: {told}")
         elif command.reason is None or phase == Phase.DONE:
             self._reporter.tell(Status.OK, phase)
+        elif self._astray:
+            told = f"braking: {command.text}; it stays at rest until this node is started again"
+            self._reporter.tell(Status.DEGRADED, told, {"reason": str(command.reason)})
         else:
             self._reporter.tell(Status.DEGRADED, f"braking: {command.text}", {"reason": str(command.reason)})
         return command
@@ -289,12 +282,15 @@ class KinematicSystem:
         paths, moving = self._paths.take(), self._moving.newest()
         if controller is None:
             return
-        try:
-            for message in paths:
+        for message in paths:
+            try:
                 if not len(messages.waypoints(message)):
                     controller.see(Estimate.lost(stamp_and_frame(message)[0], "the path is empty"))
-            if moving is None:
-                return
+            except FrameError as error:
+                self._reporter.tell(Status.DEGRADED, str(error))
+        if moving is None:
+            return
+        try:
             known = messages.moving_waypoints(moving)
             if known is not None:
                 self._motion.announce(known[1])
@@ -303,48 +299,9 @@ class KinematicSystem:
             self._reporter.tell(Status.DEGRADED, str(error))
 
     def _send(self, now: float, command: Command) -> None:
-        if self._sent and self._sent[-1][0] > now + self.period:
-            self._sent.clear()  # the clock was set back
-        if not self._sent:
-            self._sent.append((now, np.zeros(self._arm.count)))
-        self._sent.append((now + self.period, self._sent[-1][1] + self.period * command.velocity))
+        self._commanded.command(now, command.velocity)
         self._velocities.put(messages.numbers(command.velocity))
         held = header(round(now * 1e9), "")
         self._commands.put(messages.joint_state(held, self._arm.joint_names, None, command.velocity))
         if self._motion.stamp_ns is not None:
             self._basis.put(messages.time_reference(held, self._motion.stamp_ns))
-
-
-def position_at(
-    now: float, reading: JointReading, sent: Sequence[tuple[float, FloatArray]] = (), response: float = 0.0
-) -> FloatArray | None:
-    """Where the joints are by now if they did what they were told, (n,), rad; None if the reading is not of now.
-
-    By their own velocity they would seem to run away wherever messages are lost while they turn round.
-
-    Parameters
-    ----------
-    now : float
-        Seconds since 1970.
-    reading : JointReading
-        What the arm told last.
-    sent : sequence of (float, (n,) float array)
-        How far the joints had been sent in all by each time, ascending, rad.
-    response : float
-        How much later the joints do so, seconds.
-    """
-    age = now - reading.stamp_ns / NANOSECONDS
-    if not -MAX_FUTURE <= age <= JOINTS_FRESH:
-        return None
-    if not sent or age <= 0:
-        return reading.position
-    return reading.position + _way_at(now - response, sent) - _way_at(now - response - age, sent)
-
-
-def _way_at(time: float, sent: Sequence[tuple[float, FloatArray]]) -> FloatArray:
-    """How far the joints had been sent by a time, between the two entries beside it."""
-    later = bisect_left(sent, time, key=itemgetter(0))
-    if not 0 < later < len(sent):
-        return sent[min(later, len(sent) - 1)][1]
-    (start, way), (end, further) = sent[later - 1], sent[later]
-    return way + (time - start) / (end - start) * (further - way)

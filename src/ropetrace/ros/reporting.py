@@ -13,12 +13,17 @@ from ropetrace.types import Status
 EVERY = 1.0
 """Between two messages that say the same, seconds."""
 
+AGAIN = 0.1
+"""After which a change is told once more, seconds: a message may be lost."""
+
 SILENCE = 1.0
 """A topic on which nothing has come for this long is told, seconds."""
 
 
 class Reporter:
     """Tells how a node is: on ``/diagnostics`` each second and at every change, and changes on stderr.
+
+    What comes and goes many times a second is on stderr once a second.
 
     Parameters
     ----------
@@ -29,21 +34,23 @@ class Reporter:
     def __init__(self, node: RosNode) -> None:
         self._name = node.name
         self._publisher = node.publisher("/diagnostics", DIAGNOSTICS)
-        self._kind = ""
-        self._told = -EVERY
+        self._kind = self._said_last = ""
+        self._due = 0.0
+        self._said: dict[str, float] = {}
         self._heard = time.monotonic()
 
     def tell(self, status: Status, text: str, values: dict[str, str] | None = None) -> None:
         """Say it, if it is new or a second has passed; figures alone make nothing new."""
         now, kind = time.monotonic(), f"{status} {re.sub(r'[-+]?[0-9][0-9.e+-]*', '#', text)}"
-        changed = kind != self._kind
-        if not changed and now - self._told < EVERY:
-            return
-        if changed:
+        if kind != self._said_last and now - self._said.get(kind, -EVERY) >= EVERY:
             say(f"{self._name}: {status}: {text}")
-        self._kind, self._told = kind, now
-        held = header(time.time_ns(), "")
-        self._publisher.put(diagnostics(held, f"ropetrace: {self._name}", status, text, values or {}))
+            self._said = {one: when for one, when in self._said.items() if now - when < EVERY} | {kind: now}
+            self._said_last = kind
+        changed, self._kind = kind != self._kind, kind
+        if changed or now >= self._due:
+            self._due = now + (AGAIN if changed else EVERY)
+            held = header(time.time_ns(), "")
+            self._publisher.put(diagnostics(held, f"ropetrace: {self._name}", status, text, values or {}))
 
     def heard(self) -> None:
         """Note that what the node lives on has come."""

@@ -9,4 +9,6 @@ import sys
 def say(text: str) -> None:
     """Print a line on stderr; if nobody reads that any more, the node goes on without it."""
     with contextlib.suppress(OSError):
-        print(text, file=sys.stderr, flush=True)
+        # In one piece: several nodes may write to the same terminal.
+        sys.stderr.write(f"{text}\n")
+        sys.stderr.flush()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -15,6 +17,7 @@ from ropetrace.errors import ConfigError, FrameError
 from ropetrace.evaluation.case1 import CONDITIONS, Case1Settings, rope_config, scenario
 from ropetrace.evaluation.case2 import CONTROL_RATE, PLACEMENTS
 from ropetrace.recordings.ros_frames import frame_messages
+from ropetrace.recordings.ros_messages import RawMessage
 from ropetrace.results.ros_estimates import header, topic_of
 from ropetrace.ros import messages
 from ropetrace.ros.graph import Publisher, RosNode
@@ -31,9 +34,17 @@ COMMAND_LASTS = 0.1
 JOINT_STATES_EVERY = 2
 """Control periods between two messages of the joints."""
 
-MOST_BEHIND = 0.5
-"""A simulation that is slower than real time by more is told, and its clock set, seconds."""
+COMMANDS_KEPT = 128
+"""Joint commands that wait for their time, which comes late where the simulation is behind real time."""
 
+TOLD_BEHIND = 0.1
+"""A simulation that is behind real time by more is told, seconds."""
+
+MOST_BEHIND = 0.5
+"""If by more than this, its clock is set, seconds."""
+
+ARM = "panda"
+"""Whose joints at the start `evaluation.case2.PLACEMENTS` has."""
 
 _ROUNDING = 1e-9
 """Stamps and steps are sums of fractions: without it a frame comes a step late, seconds."""
@@ -56,8 +67,6 @@ class CellSettings:
 
     wind: float = 0.0
     """How often the wind turns in a second; 0 is no wind."""
-    arm: str = "panda"
-    """One whose start `evaluation.case2.PLACEMENTS` knows: panda or fr3."""
     warm_up: float = 2.0
     """Seconds of simulated time before the first frame."""
     condition: str = CONDITIONS[0].name
@@ -107,11 +116,12 @@ class SimulatedCell:
         settings = settings or CellSettings()
         shared = Case1Settings(warm_up=settings.warm_up)
         self.simulated = SimulatedScene(scenario(_CONDITIONS[settings.condition], settings.wind, shared))
-        self._arm = Arm.named(settings.arm)
+        self._arm = Arm.named(ARM)
         self._node = node
         self._images: dict[str, Publisher] = {}
         self._joints = node.publisher("/joint_states", JOINTS)
-        self._commands = node.subscription(topic_of(0, "joint_commands"), JOINTS)
+        self._commands = node.subscription(topic_of(0, "joint_commands"), JOINTS, COMMANDS_KEPT)
+        self._waiting: deque[RawMessage] = deque(maxlen=COMMANDS_KEPT)
         self._reporter = Reporter(node)
         self._warm_up = settings.warm_up
         self._now = 0.0
@@ -125,7 +135,7 @@ class SimulatedCell:
         self._arm_start = self._now
         self._away_until = self._now + ARM_AWAY
         self._velocity = np.zeros(self._arm.count)
-        self._commanded = -COMMAND_LASTS
+        self._commanded = -math.inf
 
     def run(self, should_stop: Callable[[], bool], on_tick: Callable[[float], object] = lambda now: None) -> None:
         """Simulate in real time until told to stop.
@@ -142,7 +152,6 @@ class SimulatedCell:
         frame = int(np.ceil(self._warm_up * camera.rate)) + 1
         tick = 0
         started = time.time()
-        self._reporter.tell(Status.OK, "simulating")
         while not should_stop():
             tick += 1
             now = self._now = tick / CONTROL_RATE
@@ -150,8 +159,12 @@ class SimulatedCell:
             if ahead < -MOST_BEHIND:
                 started -= ahead
                 self._reporter.tell(Status.DEGRADED, f"slower than real time: {-ahead:.1f} s were left out")
+            elif ahead < -TOLD_BEHIND:
+                self._reporter.tell(Status.DEGRADED, f"{-ahead:.2f} s behind real time")
+            else:
+                self._reporter.tell(Status.OK, "simulating")
             time.sleep(max(ahead, 0.0))
-            self.moving.advance(now - self._arm_start, self._command())
+            self.moving.advance(now - self._arm_start, self._command(started + now))
             if camera.stamp(frame) <= self._warm_up + now + _ROUNDING:
                 self.simulated.robot = self.moving.capsules()
                 exposed = camera.expose(self.simulated.scene_at, camera.stamp(frame), frame)
@@ -165,15 +178,20 @@ class SimulatedCell:
                 self._joints.put(state)
             on_tick(now)
 
-    def _command(self) -> FloatArray:
-        message = self._commands.newest()
-        if message is not None:
+    def _command(self, moment: float) -> FloatArray:
+        """What the joints do by the commands that had come by a moment, seconds since 1970, (n,), rad/s.
+
+        A real arm does not wait while this process does.
+        """
+        self._waiting.extend(self._commands.take())
+        while self._waiting and self._waiting[0].log_time_ns <= moment * 1e9:
+            message = self._waiting.popleft()
             try:
                 self._velocity = messages.joint_values(message, self._arm.joint_names, "velocity")
-                self._commanded = time.monotonic()
+                self._commanded = message.log_time_ns / 1e9
             except FrameError as error:
                 self._reporter.tell(Status.DEGRADED, str(error))
-        if time.monotonic() - self._commanded > COMMAND_LASTS or self._now < self._away_until:
+        if moment - self._commanded > COMMAND_LASTS or self._now < self._away_until:
             self._velocity = np.zeros(self._arm.count)
         return self._velocity
 

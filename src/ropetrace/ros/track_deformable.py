@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ropetrace.config import RopeConfig
 from ropetrace.results.ros_estimates import DIAGNOSTICS, PATH, estimate_status, header, topic_of
 from ropetrace.results.ros_packed import pack_path, pack_poses
-from ropetrace.ros.graph import Publisher, RosNode
+from ropetrace.ros.graph import MAX_FUTURE, Publisher, RosNode
 from ropetrace.ros.live_camera import CameraTopics, LiveCamera, Seen
 from ropetrace.ros.messages import POSES
 from ropetrace.ros.reporting import Reporter
@@ -20,9 +20,6 @@ from ropetrace.types import Estimate, Status
 
 if TYPE_CHECKING:
     from ropetrace.ros.robot_filter import RobotFilter
-
-MAX_FUTURE = 0.02
-"""A stamp further ahead of this machine's clock than this is told, seconds."""
 
 
 class TrackDeformable:
