@@ -14,10 +14,12 @@ takes; and the memory and processor time of each node.
 from __future__ import annotations
 
 import argparse
+import re
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -87,6 +89,7 @@ class Watcher:
         self._known: set[int] = set()
         self._phase = ""
         self._since = 0.0
+        self._put_back = 0.0
         self._step = 0
         self._farthest = 0.0
 
@@ -99,13 +102,16 @@ class Watcher:
             if status.name == "ropetrace: kinematic_system" and phase in PHASES:
                 self._enter(phase, now)
             elif status.level:
-                self._wind.told.append(f"{status.name.removeprefix('ropetrace: ')}: {status.message}")
+                told = re.sub(r"[0-9][0-9.]*", "#", status.message)
+                self._wind.told.append(f"{status.name.removeprefix('ropetrace: ')}: {told}")
         if self._phase == "tracing":
             if self._step % READING_EVERY == 0:
                 self._read()
             self._step += 1
         if self._phase in PHASES[:2] and now - self._since > LONGEST:
-            self._end("too slow")
+            self._end("too slow", now)
+        elif self._phase not in PHASES[:2] and now - self._put_back > LONGEST:
+            self._end("never began", now)
 
     def _enter(self, phase: str, now: float) -> None:
         before, self._phase = self._phase, phase
@@ -116,19 +122,21 @@ class Watcher:
         if phase == "tracing":
             self._step, self._farthest = 0, 0.0
         elif phase in PHASES[2:] and before in PHASES[:2]:
-            self._end(phase)
+            self._end(phase, now)
 
-    def _end(self, outcome: str) -> None:
-        if self._phase != "approaching":
-            self._read()
+    def _end(self, outcome: str, now: float) -> None:
+        self._see(tool_errors(self._cell.simulated, self._cell.moving))
         self._wind.outcomes.append(outcome)
         self._wind.traced.append(self._farthest)
-        self._phase = ""
+        self._phase, self._put_back, self._farthest = "", now, 0.0
         self._cell.put_back()
 
     def _read(self) -> None:
         errors = tool_errors(self._cell.simulated, self._cell.moving)
         self._wind.readings.append(errors)
+        self._see(errors)
+
+    def _see(self, errors: ToolErrors) -> None:
         if errors.linear < 0.05:
             self._farthest = max(self._farthest, errors.place)
 
@@ -181,6 +189,8 @@ def nodes(settings: Path, shared_memory: bool) -> Iterator[list[Process]]:
             command = [sys.executable, "-m", "ropetrace", "node", name, "--config", str(settings), "--router", ROUTER]
             if shared_memory:
                 command.append("--shared-memory")
+            if name == "track_deformable":
+                command.append("--self-filter")
             if name == "kinematic_system":
                 command += [f"--rate={CONTROL_RATE:g}", f"--response={RESPONSE:g}", f"--tool-turn={TOOL_TURN:g}"]
             started.append(Process(name, subprocess.Popen(command, stderr=subprocess.DEVNULL)))
@@ -250,8 +260,7 @@ def main() -> None:
 def _line(wind: Wind) -> str:
     done = wind.outcomes.count("done")
     failed = "".join(f", {outcome}" for outcome in wind.outcomes if outcome != "done")
-    told = {text: wind.told.count(text) for text in dict.fromkeys(wind.told)}
-    notes = "; ".join(f"{count} x {text}" for text, count in list(told.items())[:6])
+    notes = "; ".join(f"{count} x {text}" for text, count in Counter(wind.told).items())
     return f"{wind.frequency:g} Hz: {done} of {len(wind.outcomes)} done{failed}; told: {notes or 'nothing'}"
 
 

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
     from ropetrace.ros.graph import RosNode
 
+ROUTER_EVERY = 0.5
+"""Between two looks for the router, seconds."""
+
 
 @dataclass(frozen=True)
 class Reach:
@@ -63,8 +66,8 @@ class Reach:
             raise ConfigError(f"--{given[0]} is for --ros zenoh alone, not for --ros {self.ros}: {told[self.ros]}")
         return self.ros
 
-    def node(self, name: str) -> RosNode:
-        """Join the graph; says so if there is no router, or no roscore."""
+    def node(self, name: str, should_stop: Callable[[], bool]) -> RosNode | None:
+        """Join the graph; says so if there is no router, or no roscore. None if told to stop while it waits for one."""
         way = self.way()
         if way == "rclpy":
             from ropetrace.ros.rclpy_graph import RclpyNode
@@ -74,9 +77,9 @@ class Reach:
             from ropetrace.ros.rospy_graph import RospyNode
 
             return RospyNode(name)
-        return self._zenoh_node(name)
+        return self._zenoh_node(name, should_stop)
 
-    def _zenoh_node(self, name: str) -> RosNode:
+    def _zenoh_node(self, name: str, should_stop: Callable[[], bool]) -> RosNode | None:
         from ropetrace.ros.zenoh_graph import ZenohNode
         from ropetrace.ros.zenoh_session import START_ROUTER, Connection, router_answers
 
@@ -86,6 +89,11 @@ class Reach:
         )
         if not router_answers(self.router):
             say(f"{name}: no router at {self.router} yet: {START_ROUTER}")
+            # A peer joins when one comes; a client is nothing without.
+            while connection.mode == "client" and not router_answers(self.router):
+                if should_stop():
+                    return None
+                time.sleep(ROUTER_EVERY)
         return ZenohNode(name, connection)
 
 
@@ -197,14 +205,21 @@ class KinematicSystem:
 
 
 @dataclass(frozen=True)
-class Sim:
-    """A simulated camera, rope and arm, for trying the others."""
+class Simulated:
+    """What is simulated."""
 
-    reach: OmitArgPrefixes[Reach]
     wind: Annotated[float, arg(metavar="HZ")] = 0.0
     """How often the wind turns in a second; 0.8 is the rope's resonance, 0 no wind."""
     condition: Literal["30fps", "60fps"] = "30fps"
     """The camera: 480x360 at 30 frames a second, or 1280x720 at 60."""
+
+
+@dataclass(frozen=True)
+class Sim:
+    """A simulated camera, rope and arm, for trying the others."""
+
+    reach: OmitArgPrefixes[Reach]
+    simulated: OmitArgPrefixes[Simulated]
     settings: Annotated[Path | None, arg(metavar="FILE")] = None
     """Write the settings for the other nodes, for their --config."""
 
@@ -213,7 +228,7 @@ class Sim:
 
         if self.settings is not None:
             _write_settings(self.settings, cell_config())
-        settings = CellSettings(self.wind, condition=self.condition)
+        settings = CellSettings(self.simulated.wind, condition=self.simulated.condition)
         return _run(self.reach, "ropetrace_sim", lambda node: SimulatedCell(node, settings))
 
 
@@ -244,14 +259,14 @@ class All:
     robot: OmitArgPrefixes[Robot]
     commands: OmitArgPrefixes[Commands]
     reach: OmitArgPrefixes[Reach]
+    simulated: OmitArgPrefixes[Simulated]
     self_filter: bool = False
     """Take the arm out of the images, by where its joints are."""
     simulate: bool = False
-    """With the simulated camera and arm, and their settings in the place of a rope's."""
+    """With a simulated camera and arm, and the settings for their rope."""
 
     def run(self) -> int:
-        if self.self_filter:
-            _check_images(self.images)
+        self._check()
         way = self.reach.way()
         if way == "zenoh":
             import_extra("zenoh", "ros2")
@@ -277,13 +292,24 @@ class All:
                 "kinematic_system": [*rope, *robot, *_flags(self.commands), *reach],
             }
             if self.simulate:
-                commands = {"sim": reach, **commands}
+                commands = {"sim": [*reach, *_flags(self.simulated)], **commands}
             if way == "zenoh":
                 from ropetrace.ros.zenoh_session import router_answers
 
                 if not router_answers(self.reach.router):
                     commands = {ROUTER: ["--router", self.reach.router], **commands}
             return supervise(commands, told_to_stop())
+
+    def _check(self) -> None:
+        """Options that would do nothing are refused."""
+        if self.self_filter:
+            _check_images(self.images)
+        if not self.simulate:
+            for flag in _flags(self.simulated)[:1]:
+                raise ConfigError(f"{flag} is for --simulate")
+            return
+        for flag in [*_flags(self.rope), *_flags(self.images), *_flags(self.robot)][:1]:
+            raise ConfigError(f"{flag}: --simulate brings its own rope, camera and arm: leave it out")
 
 
 @dataclass(frozen=True)
@@ -312,10 +338,12 @@ class Node:
 def _run(reach: Reach, name: str, make: Callable[[RosNode], Any]) -> int:
     """Make a node and let it run until Ctrl-C."""
     should_stop = told_to_stop()
-    with reach.node(name) as node:
-        made = make(node)
-        say(f"{name}: running")
-        made.run(should_stop)
+    joined = reach.node(name, should_stop)
+    if joined is not None:
+        with joined as node:
+            made = make(node)
+            say(f"{name}: running")
+            made.run(should_stop)
     say(f"{name}: ended")
     return 0
 
