@@ -265,14 +265,14 @@ def test_a_report_names_the_failure_and_goes_on(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("fakes", "forked")
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_method_that_dies_or_hangs_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int) -> None:
-    monkeypatch.setattr(workers, "LONGEST_SILENCE", 2.0)
+    monkeypatch.setattr(workers, "LONGEST_SILENCE", 10.0)
     folder = comparison_folder(tmp_path / "out")
     folder.begin({"suite": "1"})
     tasks = [task(method) for method in ("dying", "perfect", "hanging", "off")]
     run_tasks(folder, tasks, jobs)
     runs = {task.config.method: folder.load(task) for task in tasks}
     assert str(runs["dying"].failure) == "its process was killed (SIGKILL)"
-    assert str(runs["hanging"].failure) == "it hung: no frame was finished for 2 s"
+    assert str(runs["hanging"].failure) == "it hung: no frame was finished for 10 s"
     for method, run in runs.items():
         assert len(run) == FRAMES
         assert run.has_truth
@@ -387,11 +387,11 @@ def test_an_interrupted_comparison_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "ropetrace", "compare", "suite", "-m", "slicing", "-j", "1", "-o", str(out)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        end = time.monotonic() + 60
+        end = time.monotonic() + 300
         while not list(out.glob("runs/*.npz")) and time.monotonic() < end:
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=30)
+        _, said = process.communicate(timeout=300)
     assert process.returncode == 130
     assert re.search(r"interrupted; [1-9]\d* of \d+ runs are finished", said)
     assert list(out.glob("runs/still.slicing.npz"))

