@@ -66,6 +66,12 @@ class Tab:
         box = self.value(f"document.querySelector('{selector}').getBoundingClientRect().toJSON()")
         self.click(box["x"] + across * box["width"], box["y"] + down * box["height"])
 
+    def press_key(self, key: str, code: int) -> None:
+        """Press and release a key, by its name and its number in Windows."""
+        text = {"text": key} if len(key) == 1 else {}
+        for kind in ("keyDown", "keyUp"):
+            self.do("Input.dispatchKeyEvent", type=kind, key=key, windowsVirtualKeyCode=code, **text)
+
     def screenshot(self, path: Path) -> None:
         """Save what the window shows."""
         path.write_bytes(base64.b64decode(self.do("Page.captureScreenshot", format="png")["data"]))
@@ -83,15 +89,25 @@ def chromium(folder: Path, width: int = 1400, height: int = 900) -> Iterator[Tab
     process = subprocess.Popen([*command, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         port = _port(folder / "DevToolsActivePort", process)
-        with build_opener(ProxyHandler({})).open(f"http://127.0.0.1:{port}/json/list", timeout=_PATIENCE) as answer:
-            page = next(target for target in json.load(answer) if target["type"] == "page")
-        with connect(page["webSocketDebuggerUrl"], max_size=None, proxy=None, origin=None) as socket:
+        with connect(_page(port), max_size=None, proxy=None, origin=None) as socket:
             tab = Tab(socket)
             tab.do("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
             yield tab
     finally:
         process.terminate()
         process.wait(timeout=_PATIENCE)
+
+
+def _page(port: int) -> str:
+    """The address of the page's debugger, once the browser lists it."""
+    until = time.monotonic() + _PATIENCE
+    while time.monotonic() < until:
+        with build_opener(ProxyHandler({})).open(f"http://127.0.0.1:{port}/json/list", timeout=_PATIENCE) as answer:
+            for target in json.load(answer):
+                if target["type"] == "page":
+                    return str(target["webSocketDebuggerUrl"])
+        time.sleep(0.05)
+    raise AssertionError("the browser lists no page")
 
 
 def _port(file: Path, process: subprocess.Popen[bytes]) -> int:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import glob
 import http.client
+import io
 import os
 import re
 import signal
@@ -12,10 +15,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -29,8 +32,8 @@ from ropetrace.cli_serve import _View
 from ropetrace.errors import ConfigError, OutputError
 from ropetrace.results.feed import stop_rerun
 from ropetrace.serving import ViewServer
-from ropetrace.serving_gate import READ_PATH, Gate, Request
-from ropetrace.terminal import BAD_INPUT
+from ropetrace.serving_gate import READ_PATH, Gate, Request, _bring_messages
+from ropetrace.terminal import BAD_INPUT, ENDINGS
 from ropetrace.types import BadFrame
 
 PATIENCE = 60.0
@@ -56,9 +59,10 @@ def is_running(pid: int) -> bool:
 
 
 def children(pid: int) -> list[int]:
-    found = []
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        found += [int(child) for child in (task / "children").read_text().split()]
+    found: list[int] = []
+    for file in glob.glob(f"/proc/{pid}/task/*/children"):
+        with contextlib.suppress(OSError):  # it may have ended
+            found += map(int, Path(file).read_text().split())
     return found + [grandchild for child in found for grandchild in children(child)]
 
 
@@ -222,7 +226,7 @@ def test_a_port_that_is_taken(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         monkeypatch.setattr(sys, "argv", ["ropetrace", "serve", "sim:still", *ROPE, "--port", str(port)])
-        before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+        before = {number: signal.getsignal(number) for number in ENDINGS}
         with pytest.raises(SystemExit) as raised:
             cli.main()
         for number, handler in before.items():
@@ -264,9 +268,9 @@ def test_on_loopback_one_enters_by_its_names(name: str) -> None:
 
 def test_further_out_one_needs_the_key() -> None:
     gate = Gate("0.0.0.0", 0)
-    key = parse_qs(urlsplit(gate.url).query)["key"][0]
+    key = parse_qs(urlsplit(gate.door.url).query)["key"][0]
     assert len(key) > 20
-    for given in ({}, {"Cookie": f"ropetrace_{gate.port}=wrong"}):
+    for given in ({}, {"Cookie": f"ropetrace_{gate.door.port}=wrong"}):
         answer = gate.answer(request("/?url=x", Host="robot:9090", **given))
         assert answer is not None
         assert answer.startswith(b"HTTP/1.1 403 ")
@@ -275,11 +279,11 @@ def test_further_out_one_needs_the_key() -> None:
     assert answer is not None
     head = answer.decode()
     assert head.startswith("HTTP/1.1 302 ")
-    assert f"Set-Cookie: ropetrace_{gate.port}={key}; Path=/; HttpOnly; SameSite=Lax" in head
+    assert f"Set-Cookie: ropetrace_{gate.door.port}={key}; Path=/; HttpOnly; SameSite=Lax" in head
     assert key not in head.partition("Location: ")[2].partition("\r\n")[0]
-    assert gate.answer(request("/?url=x", Host="robot:9090", Cookie=f"ropetrace_{gate.port}={key}")) is None
+    assert gate.answer(request("/?url=x", Host="robot:9090", Cookie=f"ropetrace_{gate.door.port}={key}")) is None
     # Cookies of other servers of that machine may be anything.
-    foreign = 'settings={"a": [1, 2]}; x' + f"ropetrace_{gate.port}=wrong; ropetrace_{gate.port}={key}; b=c"
+    foreign = 'settings={"a": [1, 2]}; x' + f"ropetrace_{gate.door.port}=wrong; ropetrace_{gate.door.port}={key}; b=c"
     assert gate.answer(request("/?url=x", Host="robot:9090", Cookie=foreign)) is None
     answer = gate.answer(request(f"/?url=x&key={key}", Host="robot:9090", Origin="http://evil.example"))
     assert answer is not None
@@ -312,7 +316,7 @@ def test_a_viewer_that_does_not_read_holds_up_nobody(monkeypatch: pytest.MonkeyP
     with socket.create_server(("127.0.0.1", 0)) as server:
         threading.Thread(target=send, args=(server,), daemon=True).start()
         gate.open(server.getsockname(), server.getsockname())
-        answer = ask(gate.url, "POST", READ_PATH, NOTHING)
+        answer = ask(gate.door.url, "POST", READ_PATH, NOTHING)
         assert sent.wait(PATIENCE), "the sender waits for the viewer"
         received = answer.read()
     gate.close()
@@ -341,7 +345,7 @@ def test_a_viewer_that_takes_nothing_is_cut_off(monkeypatch: pytest.MonkeyPatch)
     with socket.create_server(("127.0.0.1", 0)) as server:
         threading.Thread(target=send, args=(server,), daemon=True).start()
         gate.open(server.getsockname(), server.getsockname())
-        answer = ask(gate.url, "POST", READ_PATH, NOTHING)
+        answer = ask(gate.door.url, "POST", READ_PATH, NOTHING)
         assert ended.wait(PATIENCE)
         until(lambda: not gate._connections)
         received = b""
@@ -350,6 +354,42 @@ def test_a_viewer_that_takes_nothing_is_cut_off(monkeypatch: pytest.MonkeyPatch)
                 received += piece
     gate.close()
     assert 0 < len(received) < size
+
+
+def test_a_slow_link_may_take_long_over_a_message() -> None:
+    """Each wait for the viewer is for a piece, however long the message is."""
+    body = os.urandom(1 << 20)
+    message = b"\0" + len(body).to_bytes(4, "big") + body
+    sent: list[bytes] = []
+
+    class Viewer:
+        def __init__(self) -> None:
+            self.pieces = [b""]
+
+        def write(self, data: bytes) -> None:
+            self.pieces[-1] += data
+
+        def writelines(self, lines: Iterable[bytes]) -> None:
+            self.write(b"".join(lines))
+
+        async def drain(self) -> None:
+            self.pieces.append(b"")
+
+    async def bring() -> None:
+        rerun = asyncio.StreamReader()
+        rerun.feed_data(b"%x\r\n" % len(message) + message + b"\r\n0\r\n\r\n")
+        rerun.feed_eof()
+        viewer = Viewer()
+        await _bring_messages(rerun, cast(asyncio.StreamWriter, viewer))
+        sent.extend(viewer.pieces)
+
+    asyncio.run(bring())
+    assert max(map(len, sent)) < serving_gate.PIECE_BYTES + 100
+    stream, received = io.BytesIO(b"".join(sent)), b""
+    while size := int(stream.readline(), 16):
+        received += stream.read(size)
+        stream.readline()
+    assert received == message
 
 
 @contextmanager
@@ -368,12 +408,12 @@ def test_viewers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serving_gate, "MOST_VIEWERS", 2)
     monkeypatch.setattr(serving_gate, "HEAD_SECONDS", PATIENCE)
     with idle_gate() as gate:
-        viewers = [http.client.HTTPConnection("127.0.0.1", gate.port, timeout=PATIENCE) for _ in range(2)]
+        viewers = [http.client.HTTPConnection("127.0.0.1", gate.door.port, timeout=PATIENCE) for _ in range(2)]
         for viewer in viewers:
             viewer.request("POST", READ_PATH, NOTHING)
         until(lambda: gate._viewers == 2)
-        assert ask(gate.url, "POST", READ_PATH, NOTHING).status == 503
-        assert ask(gate.url, "GET", "/").status == 302
+        assert ask(gate.door.url, "POST", READ_PATH, NOTHING).status == 503
+        assert ask(gate.door.url, "GET", "/").status == 302
         viewers[0].close()
         until(lambda: gate._viewers == 1)
         viewers[0].request("POST", READ_PATH, NOTHING)
@@ -386,12 +426,12 @@ def test_connections_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serving_gate, "MOST_CONNECTIONS", 3)
     monkeypatch.setattr(serving_gate, "HEAD_SECONDS", PATIENCE)
     with idle_gate() as gate:
-        silent = [socket.create_connection(("127.0.0.1", gate.port), PATIENCE) for _ in range(3)]
+        silent = [socket.create_connection(("127.0.0.1", gate.door.port), PATIENCE) for _ in range(3)]
         until(lambda: gate._connections == 3)
-        assert ask(gate.url, "GET", "/").status == 503
+        assert ask(gate.door.url, "GET", "/").status == 503
         silent.pop().close()
         until(lambda: gate._connections == 2)
-        assert ask(gate.url, "GET", "/").status == 302
+        assert ask(gate.door.url, "GET", "/").status == 302
         for connection in silent:
             connection.close()
 
@@ -400,10 +440,10 @@ def test_connections_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_all_networks_are_those_of_both_kinds() -> None:
     gate = Gate("::", 0)
     gate.open(("127.0.0.1", 1), ("127.0.0.1", 1))
-    assert gate.key
+    assert gate.door.key
     for address in ("127.0.0.1", "::1"):
-        connection = http.client.HTTPConnection(address, gate.port, timeout=PATIENCE)
-        connection.request("GET", f"/?key={gate.key}")
+        connection = http.client.HTTPConnection(address, gate.door.port, timeout=PATIENCE)
+        connection.request("GET", f"/?key={gate.door.key}")
         assert connection.getresponse().status == 302
     gate.close()
 
@@ -423,7 +463,7 @@ def test_a_second_ctrl_c_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) 
     assert view.problem is not None
     assert not view._feed.running
     with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.1", view._gate.port), PATIENCE)
+        socket.create_connection(("127.0.0.1", view._gate.door.port), PATIENCE)
 
 
 def test_a_view_that_cannot_be_fed_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -457,8 +497,10 @@ def test_the_world_needs_the_pose_before_the_address_is_told(tmp_path: Path) -> 
         (["serve", "--port", "0", *ROPE], 0),
         (["serve", "--port", "0", "--diameter", "15mm"], 0),
         (["track", "--diameter", "15mm"], 1),
+        (["record", "--out", "a.mcap"], 1),
+        (["record", "--out", "a.mcap", "--diameter", "15mm"], 1),
     ],
-    ids=["looking for colour", "serve", "track"],
+    ids=["looking for colour", "serve", "track", "record", "record and track"],
 )
 def test_ctrl_c_ends_the_wait_for_the_first_frame(arguments: list[str], expected: int, tmp_path: Path) -> None:
     """A camera is silent; what waits for half a minute says when it begins to."""
@@ -501,6 +543,14 @@ def test_a_view_that_ended_is_told_once_or_ends_the_run(capsys: pytest.CaptureFi
     assert capsys.readouterr().err.count("the tracking goes on") == 1
 
 
+def test_the_last_words_of_rerun_are_told() -> None:
+    with ViewServer("127.0.0.1", 0) as view:
+        os.kill(view._rerun._process.pid, signal.SIGSEGV)
+        until(lambda: view.problem)
+        assert view.problem is not None
+        assert re.fullmatch(r"the view has ended: rerun stopped with code -?\d+ \(.*SIGSEGV\)", view.problem)
+
+
 def test_a_recording_is_shown_at_its_own_pace(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr("ropetrace.cli_track.time.monotonic", lambda: now[0])
@@ -520,7 +570,7 @@ def test_a_recording_is_shown_at_its_own_pace(monkeypatch: pytest.MonkeyPatch) -
 def test_what_is_no_request_is_told(sent: bytes) -> None:
     gate = Gate("127.0.0.1", 0)
     gate.open(("127.0.0.1", 1), ("127.0.0.1", 1))
-    with socket.create_connection(("127.0.0.1", gate.port), PATIENCE) as connection:
+    with socket.create_connection(("127.0.0.1", gate.door.port), PATIENCE) as connection:
         connection.sendall(sent)
         assert connection.recv(1 << 16).startswith(b"HTTP/1.1 400 ")
     gate.close()

@@ -33,7 +33,9 @@ from ropetrace.errors import ConfigError, OutputError, RecordingError
 from ropetrace.picture import backdrop, pixels_of
 from ropetrace.recordings import Recording, open_recording
 from ropetrace.trackers import make_tracker
-from ropetrace.tune_page import TunePage, _Seat, refusal
+from ropetrace.tune_board import Board
+from ropetrace.tune_page import TunePage
+from ropetrace.tune_requests import Requests, SavedSettings
 from ropetrace.tuning import Tuning
 from ropetrace.types import BadFrame, CloudFrame, Intrinsics, RgbdFrame, Status
 from test_live import ScriptedCamera, live
@@ -76,7 +78,7 @@ def serve(folder: Path, tmp_path: Path) -> Iterator[Callable[..., TunePage]]:
 
 def request(page: TunePage, path: str, **headers: str) -> tuple[int, str]:
     """The status and the text of an answer."""
-    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=_PATIENCE)
+    connection = http.client.HTTPConnection("127.0.0.1", page.door.port, timeout=_PATIENCE)
     try:
         connection.request("GET", path, headers=headers)
         answer = connection.getresponse()
@@ -85,11 +87,11 @@ def request(page: TunePage, path: str, **headers: str) -> tuple[int, str]:
         connection.close()
 
 
-def open_socket(page: TunePage, origin: str | None = "", token: str | None = None) -> Any:
+def open_socket(page: TunePage, origin: str | None = "", key: str | None = None) -> Any:
     """A WebSocket as the page opens it; other origins may be claimed."""
-    address = f"127.0.0.1:{page.port}"
+    address = f"127.0.0.1:{page.door.port}"
     claimed = f"http://{address}" if origin == "" else origin
-    url = f"ws://{address}/socket?token={page.token if token is None else token}"
+    url = f"ws://{address}/socket?key={page.door.key if key is None else key}"
     return client.connect(url, origin=claimed, proxy=None, max_size=None)
 
 
@@ -120,20 +122,33 @@ def looked(line: Any) -> Any:
 
 
 def tuning_of(page: TunePage) -> Tuning:
-    assert page.tuning is not None
-    return page.tuning
+    assert page.board.tuning is not None
+    return page.board.tuning
 
 
-def test_the_page_wants_its_token(serve: Callable[..., TunePage], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_page_wants_its_key(serve: Callable[..., TunePage], capsys: pytest.CaptureFixture[str]) -> None:
     page = serve()
     assert page._server.socket.getsockname()[0] == "127.0.0.1"
-    status, text = request(page, f"/?token={page.token}")
+    status, text = request(page, f"/?key={page.door.key}")
     assert (status, text[:15]) == (200, "<!doctype html>")
     assert request(page, "/")[0] == 403
-    assert request(page, "/?token=wrong")[0] == 403
-    assert request(page, f"/other?token={page.token}")[0] == 404
-    assert request(page, f"/?token={page.token}", Host="rebound.example")[0] == 403
+    assert request(page, "/?key=wrong")[0] == 403
+    assert request(page, f"/other?key={page.door.key}")[0] == 404
+    assert request(page, f"/?key={page.door.key}", Host="rebound.example")[0] == 421
     assert "refused   127.0.0.1: the host 'rebound.example'" in capsys.readouterr().err
+
+
+def test_each_refusal_is_told_once_and_of_many_the_first(
+    serve: Callable[..., TunePage], capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = serve()
+    for _ in range(3):
+        assert request(page, "/?key=of-yesterday")[0] == 403
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("refused   127.0.0.1: the key is missing or wrong")
+    for number in range(50):
+        assert request(page, f"/?key={page.door.key}", Host=f"rebound{number}.example")[0] == 421
+    assert 1 < len(capsys.readouterr().err.splitlines()) < 25
 
 
 @pytest.mark.parametrize(
@@ -148,31 +163,11 @@ def test_a_foreign_origin_is_refused(serve: Callable[..., TunePage], origin: str
         assert looked(line)["look"]["index"] == 0
 
 
-def test_a_socket_without_the_token_is_refused(serve: Callable[..., TunePage]) -> None:
+def test_a_socket_without_the_key_is_refused(serve: Callable[..., TunePage]) -> None:
     page = serve()
-    for token in ("", "wrong"):
-        with pytest.raises(exceptions.InvalidStatus), open_socket(page, token=token):
+    for key in ("", "wrong"):
+        with pytest.raises(exceptions.InvalidStatus), open_socket(page, key=key):
             pass
-
-
-def test_who_is_let_in() -> None:
-    def why(host: str, origin: str | None, given: str = "t", on_loopback: bool = True) -> str:
-        return refusal(host, origin, "t", given, on_loopback=on_loopback) or ""
-
-    assert why("localhost:9000", "http://localhost:9000") == ""
-    assert why("[::1]:80", None) == ""
-    # Further out a machine may have any name.
-    for name in ("192.168.0.7:80", "robot.lab.example:80"):
-        assert "host" in why(name, f"http://{name}")
-        assert why(name, f"http://{name}", on_loopback=False) == ""
-        assert "token" in why(name, f"http://{name}", "", on_loopback=False)
-        assert "origin" in why(name, "http://evil.example", on_loopback=False)
-    for on_loopback in (True, False):
-        assert "host" in why("", None, on_loopback=on_loopback)
-        assert "host" in why("[", None, on_loopback=on_loopback)
-    assert "origin" in why("localhost:9000", "http://localhost:9001")
-    assert "token" in why("localhost", None, "")
-    assert "token" in why("localhost", None, "ü")
 
 
 def test_an_address_that_is_none_is_told(serve: Callable[..., TunePage]) -> None:
@@ -181,7 +176,7 @@ def test_an_address_that_is_none_is_told(serve: Callable[..., TunePage]) -> None
 
 
 def test_pages_are_bounded(serve: Callable[..., TunePage], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ropetrace.tune_page._MOST_BROWSERS", 1)
+    monkeypatch.setattr("ropetrace.tune_entrance._MOST_BROWSERS", 1)
     page = serve()
     with open_socket(page) as line:
         looked(line)
@@ -193,12 +188,12 @@ def test_pages_are_bounded(serve: Callable[..., TunePage], monkeypatch: pytest.M
 def test_a_browser_that_takes_nothing_is_cut_off(
     serve: Callable[..., TunePage], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ropetrace.tune_page._STUCK", 0.3)
-    monkeypatch.setattr(TunePage, "_text_of_newest", lambda page: (page._version, page._shown, " " * (32 << 20)))
+    monkeypatch.setattr("ropetrace.tune_seat._STUCK", 0.3)
+    monkeypatch.setattr(Board, "newest", lambda board: (board.version, board.shown, " " * (32 << 20)))
     page = serve()
-    with socket.create_connection(("127.0.0.1", page.port)) as gone:
-        head = f"GET /socket?token={page.token} HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\n"
-        head += f"Origin: http://127.0.0.1:{page.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    with socket.create_connection(("127.0.0.1", page.door.port)) as gone:
+        head = f"GET /socket?key={page.door.key} HTTP/1.1\r\nHost: 127.0.0.1:{page.door.port}\r\n"
+        head += f"Origin: http://127.0.0.1:{page.door.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         gone.sendall(f"{head}Sec-WebSocket-Key: {'A' * 22}==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode())
         assert b" 101 " in gone.recv(100)
         end = time.monotonic() + _PATIENCE
@@ -210,10 +205,10 @@ def test_a_browser_that_takes_nothing_is_cut_off(
 def test_a_page_that_cannot_be_made_is_closed(
     serve: Callable[..., TunePage], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail(page: TunePage) -> Any:
+    def fail(board: Board) -> Any:
         raise ZeroDivisionError("nothing to divide")
 
-    monkeypatch.setattr(TunePage, "_text_of_newest", fail)
+    monkeypatch.setattr(Board, "newest", fail)
     page = serve()
     with open_socket(page) as line, pytest.raises(exceptions.ConnectionClosedError) as caught:
         line.recv(timeout=_PATIENCE)
@@ -221,25 +216,15 @@ def test_a_page_that_cannot_be_made_is_closed(
     assert "ZeroDivisionError: nothing to divide" in capsys.readouterr().err
 
 
-def test_what_is_sent_meanwhile_does_not_break_a_click(serve: Callable[..., TunePage]) -> None:
-    page = serve()
-    with open_socket(page) as line:
-        looked(line)
-
-    class Sent:
-        event = None
-
-        @property
-        def index(self) -> int:
-            # As if the sender had sent another one just now.
-            seat.sent.append(self)  # type: ignore[arg-type]
-            return 0
-
-    seat = _Seat()
-    seat.sent.extend([Sent(), Sent()])  # type: ignore[list-item]
+def test_a_click_on_a_frame_that_is_long_gone_counts_on_the_newest(folder: Path, tmp_path: Path) -> None:
+    board = Board(tmp_path / "rope.toml")
+    board.tuning = Tuning(open_recording(folder))
+    board.show(replace(board.shown, look=board.tuning.glance()))
     column, row = on_the_rope()
-    page._do({"do": "click", "index": 5, "column": column, "row": row}, seat)
-    assert tuning_of(page).config.color is not None
+    sent = tuple(replace(board.tuning.glance(), index=index, event=BadFrame(0, "torn")) for index in (3, 4))
+    asked = {"do": "click", "index": 2, "column": column, "row": row}
+    Requests(board, SavedSettings(board.out)).do(asked, sent)
+    assert board.tuning.config.color is not None
 
 
 def test_two_pages_show_the_same(serve: Callable[..., TunePage]) -> None:
@@ -282,7 +267,7 @@ def test_nonsense_is_answered_and_changes_nothing(serve: Callable[..., TunePage]
         assert "no such frame" in talk(line, do="go", index=9999)["said"][0]
         assert "outside" in talk(line, do="click", index=0, column=-1, row=0)["trouble"]
         assert tuning_of(page).config == RopeConfig(0.012, RED_TEXT)
-        assert not page.out.exists()
+        assert not page.file.path.exists()
     with open_socket(page) as line:
         hear(line)
         line.send("x" * 100_000)
@@ -308,30 +293,30 @@ def test_nothing_is_saved_before_the_diameter_is_known(serve: Callable[..., Tune
     with open_socket(page) as line:
         looked(line)
         assert "not known" in talk(line, do="save", replace=False)["trouble"]
-        assert not page.out.exists()
+        assert not page.file.path.exists()
         talk(line, do="set", settings={"diameter": 0.013})
         assert "--config" in talk(line, do="save", replace=False)["said"][0]
-    assert RopeConfig.from_toml(page.out).diameter == 0.013
+    assert RopeConfig.from_toml(page.file.path).diameter == 0.013
 
 
 def test_a_file_that_is_there_is_replaced_by_a_second_click_alone(serve: Callable[..., TunePage]) -> None:
     page = serve(RopeConfig(0.012))
-    page.out.write_text("mine")
+    page.file.path.write_text("mine")
     with open_socket(page) as line:
         looked(line)
         state = talk(line, do="save", replace=False)
         assert "there already" in state["trouble"]
         assert state["asks_to_replace"]
-        assert page.out.read_text() == "mine"
+        assert page.file.path.read_text() == "mine"
         assert not talk(line, do="set", settings={"diameter": 0.014})["asks_to_replace"]
         talk(line, do="save", replace=True)
-        assert RopeConfig.from_toml(page.out).diameter == 0.014
+        assert RopeConfig.from_toml(page.file.path).diameter == 0.014
         # What was saved here is saved again without a question, until somebody else has changed it.
         talk(line, do="set", settings={"diameter": 0.015})
         assert talk(line, do="save", replace=False)["said"]
-        page.out.write_text("mine again")
+        page.file.path.write_text("mine again")
         assert talk(line, do="save", replace=False)["asks_to_replace"]
-        assert page.out.read_text() == "mine again"
+        assert page.file.path.read_text() == "mine again"
 
 
 def test_a_place_that_cannot_be_written_is_told(serve: Callable[..., TunePage], tmp_path: Path) -> None:
@@ -342,6 +327,15 @@ def test_a_place_that_cannot_be_written_is_told(serve: Callable[..., TunePage], 
         for place in (tmp_path / "nowhere" / "rope.toml", tmp_path / "file" / "rope.toml", Path("/proc/rope.toml")):
             page.file.path = place
             assert "cannot be written" in talk(line, do="save", replace=False)["trouble"]
+
+
+def test_a_save_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
+    (tmp_path / "rope.toml").mkdir()
+    file = SavedSettings(tmp_path / "rope.toml")
+    with pytest.raises(OutputError, match="cannot be written"):
+        file.save("diameter = 0.012")
+    assert not file.was_saved
+    assert [path.name for path in tmp_path.iterdir()] == ["rope.toml"]
 
 
 # --- live sources ---
@@ -464,15 +458,15 @@ def test_live_frames_of_changing_size(serve: Callable[..., TunePage]) -> None:
 def test_a_port_that_is_taken(serve: Callable[..., TunePage]) -> None:
     page = serve()
     with pytest.raises(OutputError, match="cannot be listened on"):
-        serve(port=page.port)
+        serve(port=page.door.port)
 
 
-def test_a_page_for_the_whole_network_wants_its_token_too(serve: Callable[..., TunePage]) -> None:
+def test_a_page_for_the_whole_network_wants_its_key_too(serve: Callable[..., TunePage]) -> None:
     page = serve(bind="0.0.0.0")
-    assert page.url.startswith(f"http://{socket.gethostname()}:{page.port}/?token=")
+    assert page.door.url.startswith(f"http://{socket.gethostname()}:{page.door.port}/?key=")
     assert request(page, "/")[0] == 403
     for name in (socket.gethostname(), "robot.lab.example"):
-        assert request(page, f"/?token={page.token}", Host=f"{name}:{page.port}")[0] == 200
+        assert request(page, f"/?key={page.door.key}", Host=f"{name}:{page.door.port}")[0] == 200
 
 
 def test_the_command_serves_until_it_is_interrupted(folder: Path, tmp_path: Path) -> None:
@@ -551,7 +545,7 @@ def open_page(tab: Tab, url: str) -> None:
 @needs_browser
 def test_click_tune_and_save_in_a_browser(serve: Callable[..., TunePage], tab: Tab, folder: Path) -> None:
     page = serve()
-    open_page(tab, page.url)
+    open_page(tab, page.door.url)
     assert "Click on the rope" in tab.value("document.body.innerText")
 
     column, row = on_the_rope()
@@ -577,7 +571,7 @@ def test_click_tune_and_save_in_a_browser(serve: Callable[..., TunePage], tab: T
     answered(tab, lambda: tab.click_on("#save"))
     assert "saved" in tab.value("document.querySelector('#said').innerText")
     assert tab.value("document.querySelector('#trouble').innerText") == ""
-    tracker = make_tracker(RopeConfig.from_toml(page.out))
+    tracker = make_tracker(RopeConfig.from_toml(page.file.path))
     statuses = [tracker.update(frame).status for frame in open_recording(folder).frames()]
     assert statuses.count(Status.OK) == demo.FRAMES
 
@@ -585,7 +579,7 @@ def test_click_tune_and_save_in_a_browser(serve: Callable[..., TunePage], tab: T
 @needs_browser
 def test_a_click_hits_the_same_pixel_when_zoomed(serve: Callable[..., TunePage], tab: Tab) -> None:
     page = serve()
-    open_page(tab, page.url)
+    open_page(tab, page.door.url)
     column, row = on_the_rope()
     box = tab.value("document.querySelector('#image').getBoundingClientRect().toJSON()")
     tab.do("Input.dispatchMouseEvent", type="mouseWheel", x=box["x"] + 300, y=box["y"] + 300, deltaX=0, deltaY=-700)
@@ -595,6 +589,29 @@ def test_a_click_hits_the_same_pixel_when_zoomed(serve: Callable[..., TunePage],
     assert tab.value("document.querySelector('.rope').className") == "rope ok"
     assert tuning_of(page).config.diameter == pytest.approx(demo.DIAMETER, rel=0.05)
     shoot(tab, "tune_zoomed.png")
+
+
+@needs_browser
+def test_what_was_clicked_on_does_not_keep_the_keys(serve: Callable[..., TunePage], tab: Tab) -> None:
+    page = serve(RopeConfig(0.012, RED_TEXT))
+    open_page(tab, page.door.url)
+    for index, control in enumerate(("#tolerance", "#measure", "#show_slices", "summary"), 1):
+        tab.click_on(control)
+        tab.wait_for("!waiting && !queue.length")
+        before = tab.value("[serial, $('show_slices').checked, document.querySelector('details').open]")
+        tab.press_key(" ", 32)
+        answered(tab, lambda: tab.press_key("ArrowRight", 39))
+        assert tab.value("look.index") == index
+        # The space bar has pressed nothing again.
+        after = tab.value("[serial, $('show_slices').checked, document.querySelector('details').open]")
+        assert after == [before[0] + 1, *before[1:]]
+    answered(tab, lambda: tab.click_on("#box"))
+    # A number is typed after a click.
+    tab.click_on(".low")
+    for key, code in (("ArrowRight", 39), ("7", 55)):
+        tab.press_key(key, code)
+    assert "7" in tab.value("document.querySelector('.low').value")
+    assert tab.value("look.index") == 4
 
 
 class Person:
@@ -667,7 +684,7 @@ def test_from_a_cold_start_to_a_file_that_tracks_with_the_commands(tab: Tab, tmp
 def test_a_cluttered_live_scene_takes_few_clicks(serve: Callable[..., TunePage], tab: Tab) -> None:
     pytest.importorskip("mujoco", reason="mujoco is not installed: ropetrace[sim]")
     page = serve(recording=open_recording("sim:clutter"))
-    open_page(tab, page.url)
+    open_page(tab, page.door.url)
     person = Person(tab)
     person.press("#freeze")
     person.click_on_the_rope()
@@ -677,7 +694,7 @@ def test_a_cluttered_live_scene_takes_few_clicks(serve: Callable[..., TunePage],
     person.save()
     assert person.clicks <= _MOST_CLICKS
     page.stop()
-    statuses = followed(page.out, open_recording("sim:clutter"), 20)
+    statuses = followed(page.file.path, open_recording("sim:clutter"), 20)
     assert Status.LOST not in statuses
 
 
@@ -686,12 +703,12 @@ def test_a_cluttered_live_scene_takes_few_clicks(serve: Callable[..., TunePage],
 def test_real_depth_without_colour_takes_few_clicks(serve: Callable[..., TunePage], tab: Tab) -> None:
     recording = open_recording(DATA / "bcpd_rope_d435", rate=30)
     page = serve(recording=recording)
-    open_page(tab, page.url)
+    open_page(tab, page.door.url)
     person = Person(tab)
     person.press("#image")
     person.save()
     assert person.clicks <= _MOST_CLICKS
-    statuses = followed(page.out, recording, 6)
+    statuses = followed(page.file.path, recording, 6)
     assert Status.OK in statuses
     assert Status.LOST not in statuses
 
@@ -704,20 +721,20 @@ def test_a_real_coloured_cloud_takes_few_clicks(serve: Callable[..., TunePage], 
     assert isinstance(cloud, CloudFrame)
     column, row = pixels_of(cloud.points[100:101].astype(float), backdrop(cloud)[1])[0]
     page = serve(recording=recording)
-    open_page(tab, page.url)
+    open_page(tab, page.door.url)
     person = Person(tab)
     person.press("#image", (column + 0.5) / 640, (row + 0.5) / 480)
     person.press("#tolerance", 0.95)
     person.press("#measure")
     person.save()
     assert person.clicks <= _MOST_CLICKS
-    assert followed(page.out, recording, 1) == [Status.OK]
+    assert followed(page.file.path, recording, 1) == [Status.OK]
 
 
 @needs_browser
 def test_a_gate_that_takes_the_background_is_said_in_words(serve: Callable[..., TunePage], tab: Tab) -> None:
     page = serve(RopeConfig(0.012, RED_TEXT))
-    open_page(tab, page.url)
+    open_page(tab, page.door.url)
     person = Person(tab)
     person.press("#tolerance", 0.99)
     assert "takes more than the rope" in tab.value("document.querySelector('#advice').innerText")
@@ -733,7 +750,7 @@ def test_a_bad_frame_and_a_gate_that_nothing_passes_are_said_in_words(serve: Cal
     frame_at = scene()
     camera = ScriptedCamera(lambda index: None if away.is_set() else frame_at(index), 0.03)
     page = serve(RopeConfig(0.012, "#00ff00"), recording=live(camera, silence=0.2))
-    open_page(tab, page.url)
+    open_page(tab, page.door.url)
     tab.wait_for("document.querySelector('#advice').innerText.includes('raise the colour tolerance')")
     away.set()
     tab.wait_for("document.querySelector('#advice').innerText.includes('when it returns')")
@@ -764,7 +781,7 @@ def test_a_foreign_page_in_the_same_browser_gets_nothing(
     thread.start()
     tab.open(f"http://127.0.0.1:{foreign.server_port}/")
     ended = tab.value(
-        f"new Promise(done => {{ const s = new WebSocket('ws://127.0.0.1:{page.port}/socket?token={page.token}');"
+        f"new Promise(done => {{ const s = new WebSocket('ws://127.0.0.1:{page.door.port}/socket?key={page.door.key}');"
         " s.onopen = () => done('open'); s.onclose = () => done('closed'); })"
     )
     foreign.shutdown()

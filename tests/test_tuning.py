@@ -16,10 +16,12 @@ from ropetrace.config import RopeConfig, SegmentationConfig
 from ropetrace.errors import ConfigError, FrameError, RecordingError
 from ropetrace.picture import backdrop, pixels_of
 from ropetrace.recordings import Recording, RecordingInfo, open_recording
+from ropetrace.recordings.base import NO_COLOR
 from ropetrace.trackers import make_tracker
 from ropetrace.tune_advice import advice, remedy_of
+from ropetrace.tune_look import box_corners
 from ropetrace.tune_message import message_of
-from ropetrace.tuning import NO_COLOR, Tuning, box_corners
+from ropetrace.tuning import Tuning
 from ropetrace.types import BadFrame, Cloud, CloudFrame, Event, Intrinsics, RgbdFrame, Status
 from test_live import ScriptedCamera, live, tiny
 

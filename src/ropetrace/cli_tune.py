@@ -27,7 +27,7 @@ class Tune:
     out: Annotated[Path, arg(aliases=["-o"], metavar="FILE")] = Path("rope.toml")
     """Where the page saves the settings."""
     bind: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Listen on this address; any but 127.0.0.1 lets other machines in, if they have the token of the page's address.
+    """Listen on this address; any but 127.0.0.1 lets other machines in, if they have the key in the page's address.
     It is not encrypted."""
     port: Annotated[int, arg(metavar="N")] = 0
     """Listen on this port; 0: any that is free."""
@@ -43,9 +43,9 @@ class Tune:
             suppress(KeyboardInterrupt),
             TunePage(lambda: opened or self._open(), self.out, self.bind, self.port) as page,
         ):
-            if page.open_to_others:
+            if page.door.open_to_others:
                 print(f"warning   {self.bind} may be reached by other machines, and is not encrypted", file=sys.stderr)
-            print(f"page      {page.url}\nopen it in a browser; Ctrl-C ends it", flush=True)
+            print(f"page      {page.door.url}\nopen it in a browser; Ctrl-C ends it", flush=True)
             page.run_until_interrupted()
         print(f"settings  {self.out}" if page.file.was_saved else "nothing was saved")
         return 0

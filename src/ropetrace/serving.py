@@ -36,7 +36,7 @@ class ViewServer(Closing):
     Parameters
     ----------
     host, port
-        As for `ropetrace.serving_gate.Gate`.
+        As for `ropetrace.listening.Door`.
     frame_name, frame_from_camera
         As for `ropetrace.viewer.RerunLog`.
 
@@ -70,11 +70,11 @@ class ViewServer(Closing):
             log = RerunLog(recording, frame_name=frame_name, frame_from_camera=frame_from_camera, live=True)
             self._feed = Feed("view", recording, log.log, lambda: self.problem is None, FLUSH_SECONDS)
             undo.pop_all()
-        self.url, self.open_to_others = self._gate.url, bool(self._gate.key)
+        self.url, self.open_to_others = self._gate.door.url, self._gate.door.open_to_others
 
     @property
     def skipped(self) -> int:
-        """Frames that were not shown so far, or not with all their ropes."""
+        """Frames that were not shown so far, or not with all their ropes, while Rerun was there."""
         return self._feed.skipped
 
     @property
@@ -123,7 +123,10 @@ class _Rerun:
     @property
     def problem(self) -> str | None:
         code = self._process.poll()
-        return None if code is None else f"the view has ended: rerun stopped with code {code}"
+        if code is None:
+            return None
+        words = self._process.trouble
+        return f"the view has ended: rerun stopped with code {code}" + (f" ({words})" if words else "")
 
     def end(self) -> None:
         stop_rerun(self._process)

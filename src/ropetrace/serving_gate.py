@@ -8,14 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
-import hmac
 import http.client
 import io
-import ipaddress
 import re
-import secrets
-import socket
 import threading
 from collections import deque
 from collections.abc import AsyncIterator
@@ -24,7 +19,7 @@ from email.message import Message
 from http import HTTPStatus
 from urllib.parse import parse_qs, quote, urlsplit
 
-from ropetrace.errors import ConfigError, OutputError
+from ropetrace.listening import Door
 from ropetrace.results.feed import Address
 
 READ_PATH = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
@@ -103,21 +98,15 @@ class Request:
 class Gate:
     """Takes browsers in at an address of this machine.
 
-    An address of loopback is open to all programs of this machine, and to browsers that call it by its own name: so a
-    foreign page cannot get in by a name that it made point here. Any other address is open to those who have the key.
-
     Parameters
     ----------
-    host : str
-        An address of this machine, or its name; 0.0.0.0 and :: are all of them.
-    port : int
-        0: any that is free.
+    host, port
+        As for `ropetrace.listening.Door`.
 
     Attributes
     ----------
-    port : int
-    key : str
-        What the address must have; empty on loopback.
+    door : Door
+        On loopback it asks for no key.
 
     Raises
     ------
@@ -128,10 +117,7 @@ class Gate:
     """
 
     def __init__(self, host: str, port: int) -> None:
-        self._socket = listen(host, port)
-        self.port = int(self._socket.getsockname()[1])
-        self._host = host
-        self.key = "" if is_loopback(self._socket) else secrets.token_urlsafe(16)
+        self.door = Door(host, port)
         self._connections = 0
         self._viewers = 0
         self._page: Address = ("", 0)
@@ -139,11 +125,6 @@ class Gate:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._end: asyncio.Event | None = None
         self._thread: threading.Thread | None = None
-
-    @property
-    def url(self) -> str:
-        """What people open."""
-        return f"http://{authority(self._socket, self._host)}/" + (f"?key={self.key}" if self.key else "")
 
     def open(self, page: Address, stream: Address) -> None:
         """Let browsers in, to Rerun's server of the page and its server of the pictures."""
@@ -156,7 +137,7 @@ class Gate:
     def close(self) -> None:
         """Cut everybody off; a second call does nothing."""
         if self._thread is None or self._loop is None or self._end is None:
-            self._socket.close()
+            self.door.socket.close()
             return
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._end.set)
@@ -164,7 +145,7 @@ class Gate:
 
     async def _run(self, started: threading.Event) -> None:
         self._loop, self._end = asyncio.get_running_loop(), asyncio.Event()
-        server = await asyncio.start_server(self._meet, sock=self._socket, limit=PIECE_BYTES)
+        server = await asyncio.start_server(self._meet, sock=self.door.socket, limit=PIECE_BYTES)
         started.set()
         await self._end.wait()
         server.close()
@@ -212,23 +193,18 @@ class Gate:
 
         ValueError if its names are none.
         """
-        origins = request.headers.get_all("Origin") or []
-        name = urlsplit(f"//{request.host}").hostname
-        if not name or (not self.key and not is_loopback_name(name)):
-            return _answer(HTTPStatus.MISDIRECTED_REQUEST, f"{request.host!r} is no name of this machine's loopback")
-        if any(origin != f"http://{request.host}" for origin in origins):
-            return _answer(HTTPStatus.FORBIDDEN, f"the origin {origins[0]!r} is foreign")
-        cookie = f"ropetrace_{self.port}"
+        cookie = f"ropetrace_{self.door.port}"
         given = request.query.get("key", [""])[0] or request.cookie(cookie)
-        if not hmac.compare_digest(given.encode(), self.key.encode()) and self.key:
-            return _answer(HTTPStatus.FORBIDDEN, "the key is missing or wrong: open the address that serve printed")
+        refusal = self.door.refusal(request.host, request.headers.get_all("Origin") or [], given)
+        if refusal is not None:
+            return _answer(refusal.status, refusal.reason)
         if request.method == "POST" and request.path == READ_PATH:
             return None
         if request.method not in ("GET", "HEAD"):
             return _answer(HTTPStatus.METHOD_NOT_ALLOWED, "here one may only look")
         if request.path == "/" and "url" not in request.query:
             stream = quote(f"rerun+http://{request.host}/proxy", safe="")
-            keep = f"Set-Cookie: {cookie}={self.key}; Path=/; HttpOnly; SameSite=Lax\r\n" if self.key else ""
+            keep = f"Set-Cookie: {cookie}={self.door.key}; Path=/; HttpOnly; SameSite=Lax\r\n" if self.door.key else ""
             return _answer(
                 HTTPStatus.FOUND, "", f"Location: /?url={stream}&hide_welcome_screen&persist=false\r\n{keep}"
             )
@@ -300,8 +276,11 @@ async def _bring_messages(reader: asyncio.StreamReader, writer: asyncio.StreamWr
             if waiting:
                 message = waiting.popleft()
                 size -= len(message)
-                writer.writelines((b"%x\r\n" % len(message), message, b"\r\n"))
-                await asyncio.wait_for(writer.drain(), STUCK_SECONDS)
+                # In pieces: a slow link may take long over a whole message.
+                for start in range(0, len(message), PIECE_BYTES):
+                    piece = message[start : start + PIECE_BYTES]
+                    writer.writelines((b"%x\r\n" % len(piece), piece, b"\r\n"))
+                    await asyncio.wait_for(writer.drain(), STUCK_SECONDS)
             else:
                 changed.clear()
                 await changed.wait()
@@ -335,63 +314,3 @@ def _answer(status: HTTPStatus, text: str, headers: str = "") -> bytes:
         f"HTTP/1.1 {status.value} {status.phrase}\r\n{headers}Content-Type: text/plain; charset=utf-8\r\n"
         f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
     ).encode() + body
-
-
-def is_loopback_name(name: str) -> bool:
-    """Whether a name can only mean this machine's loopback; a foreign page can make any other point here."""
-    try:
-        return ipaddress.ip_address(name).is_loopback
-    except ValueError:
-        return name == "localhost" or name.endswith(".localhost")
-
-
-def _address_of(listening: socket.socket) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
-    return ipaddress.ip_address(listening.getsockname()[0].partition("%")[0])
-
-
-def is_loopback(listening: socket.socket) -> bool:
-    """Whether a socket takes connections from this machine alone."""
-    return _address_of(listening).is_loopback
-
-
-def authority(listening: socket.socket, host: str) -> str:
-    """What people call the place of a socket that listens on `host`: a name and the port."""
-    name = socket.gethostname() if _address_of(listening).is_unspecified else host
-    return f"{f'[{name}]' if ':' in name else name}:{listening.getsockname()[1]}"
-
-
-def listen(host: str, port: int, option: str = "--host") -> socket.socket:
-    """A socket that listens at an address of this machine, or at all of them: 0.0.0.0 for IPv4, :: for both.
-
-    Parameters
-    ----------
-    host : str
-        The address, or its name.
-    port : int
-        0: any that is free.
-    option : str
-        What the user gives the address by.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such address.
-    OutputError
-        If the port is taken.
-    """
-    if not 0 <= port <= 65535:
-        raise ConfigError(f"--port {port}: expected 0 to 65535")
-    try:
-        family, _, _, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE if host else 0
-        )[0]
-    except (OSError, UnicodeError) as error:
-        raise ConfigError(f"{option} {host}: there is no such address ({error}): give one of this machine's") from None
-    both = family == socket.AF_INET6 and address[0] == "::" and socket.has_dualstack_ipv6()
-    try:
-        return socket.create_server(address[:2], family=family, dualstack_ipv6=both)
-    except OSError as error:
-        what = f"{host}:{port}: cannot be listened on: {error.strerror or error}"
-        if error.errno == errno.EADDRINUSE:
-            raise OutputError(f"{what}: end what runs there, or give another --port (0: any that is free)") from None
-        raise ConfigError(f"{what}: give an address of this machine to {option}") from None

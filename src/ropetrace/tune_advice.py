@@ -13,7 +13,7 @@ from ropetrace.errors import ConfigError, FrameError
 from ropetrace.proposal import propose_diameter
 from ropetrace.things import depth_in_metres
 from ropetrace.trackers.slicing import A_SURFACE, SlicingTracker
-from ropetrace.tuning import Look
+from ropetrace.tune_look import Look
 from ropetrace.types import BadFrame, CloudFrame, Frame, RgbdFrame, Status, lacks_color
 
 _OTHER = 1.5

@@ -13,7 +13,7 @@ from PIL import Image
 from ropetrace.config import RopeConfig, default_variance_threshold
 from ropetrace.picture import backdrop, pixels_of
 from ropetrace.tune_advice import advice, remedy_of
-from ropetrace.tuning import TUNED, Look, box_corners
+from ropetrace.tune_look import TUNED, Look, box_corners
 from ropetrace.types import BadFrame, Cloud, Estimate, FloatArray, Frame, Intrinsics, RgbdFrame
 
 _MOST_POINTS = 4000

@@ -5,111 +5,24 @@ from __future__ import annotations
 import dataclasses
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ropetrace.config import RopeConfig, format_color, from_table
+from ropetrace.config import RopeConfig, from_table
 from ropetrace.errors import ConfigError, FrameError, RecordingError
 from ropetrace.live import LiveRecording
-from ropetrace.picture import backdrop, pixels_of
-from ropetrace.proposal import propose_color_at, propose_diameter
 from ropetrace.recordings import Recording
-from ropetrace.recordings.base import has_color
+from ropetrace.recordings.base import NO_COLOR, check_color, frames_to_come
 from ropetrace.trackers import Tracker, make_tracker
 from ropetrace.trackers.slicing import SlicingTracker
 from ropetrace.tracking import estimates_of
-from ropetrace.types import (
-    BadFrame,
-    Cloud,
-    CloudFrame,
-    Estimate,
-    Event,
-    FloatArray,
-    Frame,
-    Status,
-    lacks_color,
-    moved,
-)
-
-NO_COLOR = "a colour is asked for, but the recording has none: leave out the colour, or record it"
+from ropetrace.tune_look import TUNED, Look
+from ropetrace.tune_measuring import box_round, color_at, diameter_in
+from ropetrace.types import BadFrame, Cloud, Event, FloatArray, Frame, lacks_color
 
 UNKNOWN_DIAMETER = 0.012
 """What is begun with where no diameter is given, metres: the first click measures it."""
-
-TUNED = (
-    "diameter",
-    "color",
-    "segmentation.color_tolerance",
-    "segmentation.box_min",
-    "segmentation.box_max",
-    "slicing.variance_threshold",
-    "slicing.min_points",
-)
-"""The settings that can be changed."""
-
-_NEAR_CLICK = 6.0
-"""How far from a click the point of a cloud lies that is meant, pixels,"""
-
-_ONE_THING = 0.01
-"""and the others that make its colour, metres."""
-
-_SETTLED = 0.02
-"""A diameter that is measured on slices is found when it changes by less than this share."""
-
-_MOST_ROUNDS = 12
-
-_LOST_EDGES = (1.0, 1.25, 1.6, 2.0)
-"""Depth alone loses the edges of a rope: it may be this many times as thick as it looks."""
-
-_BOX_MARGIN = 0.05
-"""Between what passes and the box round it, metres."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Look:
-    """What the settings make of one frame.
-
-    Parameters
-    ----------
-    index : int
-        The frame's place in the recording, or in the frames that were taken from a live source.
-    event : RgbdFrame, CloudFrame or BadFrame
-        The frame.
-    config : RopeConfig
-        The settings.
-    knows_diameter : bool
-        Whether the diameter was given, set or measured.
-    cloud : Cloud
-        What passes; where too much does, every k-th point of it.
-    slices : (K, 3) float array
-        The centroids of its slices, metres, camera frame.
-    estimates : tuple of Estimate
-        One a rope; none as long as nobody has looked.
-    age : float, optional
-        Of a live frame when it was tracked, seconds; None for a frame that is held, or was recorded.
-    """
-
-    index: int
-    event: Event
-    config: RopeConfig
-    knows_diameter: bool
-    cloud: Cloud
-    slices: FloatArray
-    estimates: tuple[Estimate, ...]
-    age: float | None = None
-
-    @property
-    def has_color(self) -> bool:
-        """Whether there is anything for a colour gate to look at."""
-        return not isinstance(self.event, BadFrame) and not lacks_color(self.event)
-
-    @property
-    def is_gated(self) -> bool:
-        """Whether anything is kept out, or could not be for want of colour."""
-        return self.config.asks_for_color or self.config.segmentation.box_min is not None or not self.has_color
 
 
 class Tuning:
@@ -159,21 +72,21 @@ class Tuning:
         self._tracker: tuple[RopeConfig, Tracker] | None = None
         if self._live is not None and limit is not None:
             raise ConfigError(f"{recording.path}: a live source is tuned until you end it: leave out --limit")
-        ends = [end for end in (recording.frame_count, None if limit is None else start + limit) if end is not None]
-        self.end = min(ends) if ends else None
+        count = frames_to_come(recording, start, limit)
+        self.end = None if count is None else start + count
         if self._live is not None:
             self._shown: tuple[int, Event] = (0, self._newest())
         elif not self.go_to(start):
             raise RecordingError(f"{recording.path}: there is no frame {start}")
-        if self.config.asks_for_color and not self._has_color():
+        self._check_color()
+
+    def _check_color(self) -> None:
+        """Refuse a colour that the first frames have not; a live source is not begun anew to find out."""
+        if self._live is None:
+            check_color(self._recording, self.config.asks_for_color, self.first)
+        elif self.config.asks_for_color and not isinstance(self.event, BadFrame) and lacks_color(self.event):
             self.close()
             raise ConfigError(NO_COLOR)
-
-    def _has_color(self) -> bool:
-        """Whether the first frames have colour; a live source is not begun anew to find out."""
-        if self._live is not None:
-            return isinstance(self.event, BadFrame) or not lacks_color(self.event)
-        return has_color(self._recording, self.first)
 
     @property
     def name(self) -> str:
@@ -261,14 +174,10 @@ class Tuning:
         FrameError
             If the frame is bad.
         """
-        frame = _sound(self.event if event is None else event)
+        frame = self._sound(event)
         if lacks_color(frame):
             return ["there is no colour to gate with: what has depth passes", *self.measure(frame)]
-        if isinstance(frame, CloudFrame):
-            color, said = _color_in_cloud(frame, column, row), []
-        else:
-            proposal = propose_color_at(frame, column, row)
-            color, said = proposal.color, list(proposal.reasons)
+        color, said = color_at(frame, column, row)
         segmentation = dataclasses.replace(self.config.segmentation, lab_min=None, lab_max=None)
         self.config = dataclasses.replace(self.config, color=color, segmentation=segmentation)
         if not self.knows_diameter:
@@ -286,38 +195,16 @@ class Tuning:
         ConfigError, FrameError
             If it cannot be measured.
         """
-        frame = _sound(self.event if event is None else event)
-        if isinstance(frame, CloudFrame):
-            diameter = self._diameter_of_slices(frame)
-            said = [f"diameter {diameter * 1e3:.1f} mm, as the slices of the points show it: doubt it by a third"]
-        else:
-            size = propose_diameter([frame], self.config.color)
-            diameter, said = size.diameter, [f"diameter {size.text()}", *size.reasons]
-            if self.config.color is None:
-                diameter = self._with_lost_edges(frame, size.diameter)
-                said.append(f"depth loses a rope's edges: {diameter * 1e3:.1f} mm is taken; set it if you know it")
+        diameter, said = diameter_in(self._sound(event), self.config)
         self.change({"diameter": round(diameter, 5)})
         return said
 
-    def _diameter_of_slices(self, frame: Frame) -> float:
-        """The diameter at which the slices are as wide as it says."""
-        diameter = self.config.diameter
-        with suppress(ConfigError):  # thinner or thicker than any rope
-            for _ in range(_MOST_ROUNDS):
-                tracker = SlicingTracker(dataclasses.replace(self.config, diameter=diameter))
-                tracker.update(frame)
-                before, diameter = diameter, tracker.seen_diameter
-                if abs(diameter - before) < _SETTLED * before:
-                    return diameter
-        raise ConfigError("the points show no diameter: set it with its slider")
-
-    def _with_lost_edges(self, frame: Frame, diameter: float) -> float:
-        """The thinnest that a rope may be that looks this thick without colour, and is then followed well."""
-        for times in _LOST_EDGES:
-            tracker = make_tracker(dataclasses.replace(self.config, diameter=times * diameter))
-            if tracker.update(frame).status is Status.OK:
-                return times * diameter
-        return diameter
+    def _sound(self, event: Event | None) -> Frame:
+        """A frame, by default the one that is looked at; FrameError if it is bad."""
+        event = self.event if event is None else event
+        if isinstance(event, BadFrame):
+            raise FrameError(f"this frame is bad: {event.reason}")
+        return event
 
     def put_box_round(self, points: FloatArray) -> None:
         """Put a position box round points, (N, 3), metres, camera frame; a few that lie apart may stay outside.
@@ -327,17 +214,8 @@ class Tuning:
         ConfigError
             If there are none.
         """
-        if not len(points):
-            raise ConfigError("nothing passes that a box could be put round")
-        if self.config.segmentation.box_frame == "world":
-            points = moved(points, self.config.world_from_camera())
-        low, high = np.percentile(points, [1, 99], axis=0)
-        self.change(
-            {
-                "segmentation.box_min": np.round(low - _BOX_MARGIN, 3).tolist(),
-                "segmentation.box_max": np.round(high + _BOX_MARGIN, 3).tolist(),
-            }
-        )
+        low, high = box_round(points, self.config)
+        self.change({"segmentation.box_min": low, "segmentation.box_max": high})
 
     def change(self, settings: Mapping[str, Any]) -> None:
         """Change settings of `TUNED`, all or none; None is the default.
@@ -377,34 +255,3 @@ class Tuning:
         cloud = tracker.cloud()
         slices = SlicingTracker(config).slicer.slice(np.ascontiguousarray(cloud.points.T)).centroids
         return Look(index, event, config, knows_diameter, cloud, slices, estimates, age)
-
-
-def box_corners(config: RopeConfig) -> FloatArray | None:
-    """The corners of the position box in the camera's frame, (8, 3), metres; the last axis changes fastest."""
-    low, high = config.segmentation.box_min, config.segmentation.box_max
-    if low is None or high is None:
-        return None
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1).T
-    if config.segmentation.box_frame == "world":
-        corners = moved(corners, np.linalg.inv(config.world_from_camera()).astype(float))
-    return corners
-
-
-def _sound(event: Event) -> Frame:
-    if isinstance(event, BadFrame):
-        raise FrameError(f"this frame is bad: {event.reason}")
-    return event
-
-
-def _color_in_cloud(frame: CloudFrame, column: int, row: int) -> str:
-    """The colour in full light of the points about the one at a pixel: the median of the brighter half."""
-    assert frame.colors is not None
-    camera = backdrop(frame)[1]
-    ahead = np.isfinite(frame.points).all(axis=1) & (frame.points[:, 2] > 0)
-    points = frame.points[ahead].astype(float)
-    away = np.linalg.norm(pixels_of(points, camera) - [column, row], axis=1)
-    if not len(away) or away.min() > _NEAR_CLICK:
-        raise ConfigError(f"there is no point near {column},{row}: choose one on the rope")
-    near = frame.colors[ahead][np.linalg.norm(points - points[np.argmin(away)], axis=1) <= _ONE_THING]
-    bright = near[np.argsort(near.sum(axis=1), kind="stable")[len(near) // 2 :]]
-    return format_color(np.median(bright, axis=0).astype(int))
