@@ -13,13 +13,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from ropetrace.batch import DiskFullError, Outcome, ResultFolder, Task, run_batch, track_task
+from ropetrace.batch import Task, run_batch, track_task
+from ropetrace.batch_folder import DiskFullError, Outcome, ResultFolder
 from ropetrace.config import RopeConfig
 from ropetrace.errors import OutputError, RecordingError
 from ropetrace.evaluation import workers
@@ -384,6 +387,35 @@ def test_a_large_recording_may_be_read_before_its_first_frame(
     assert answer(hasty).startswith("it hung")
 
 
+def test_only_silence_that_was_listened_to_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-Z stops whoever listens, and all workers; after ``fg`` they are not taken for hung."""
+    now = [0.0]
+    monkeypatch.setattr(workers, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    worker = workers.Worker()
+    worker.begin(silent, 1000.0, False)
+    for now[0] in (1.0, 100_000.0, 100_001.0):
+        assert not worker.is_done
+    for now[0] in range(100_002, 100_002 + round(workers.LONGEST_SILENCE)):
+        is_done = worker.is_done
+    assert is_done
+    assert answer(worker) == "it hung: no frame was finished for 120 s"
+
+
+def test_the_disk_has_a_result_before_it_is_listed(tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: set[tuple[int, int]] = set()
+    fsync = os.fsync
+
+    def listen(file: int) -> None:
+        fsync(file)
+        status = os.fstat(file)
+        synced.add((status.st_ino, status.st_size))
+
+    monkeypatch.setattr(os, "fsync", listen)
+    track_task(task("a", tree / "day1" / "a"), make_folder(tmp_path / "parts"))
+    status = (tmp_path / "parts" / "a.csv").stat()
+    assert (status.st_ino, status.st_size) in synced
+
+
 def test_a_result_that_cannot_be_written_is_one_recordings_failure(tree: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with ResultFolder(out, {}, overwrite=False) as folder:
@@ -423,6 +455,20 @@ def results_are_there(out: Path, count: int) -> bool:
     return len(list(out.glob("*.csv"))) > count  # the summary is one
 
 
+@contextmanager
+def endless(recording: Path) -> Iterator[None]:
+    """The first image of a recording in a folder never comes, so that no run is over before it is ended."""
+    image = min((recording / "depth").iterdir())
+    content = image.read_bytes()
+    image.unlink()
+    os.mkfifo(image)
+    try:
+        yield
+    finally:
+        image.unlink()
+        image.write_bytes(content)
+
+
 def test_killed_half_way_and_resumed_nothing_is_done_twice(run: Run, tree: Path) -> None:
     many = tree.parent / "many"
     for index in range(40):
@@ -430,16 +476,17 @@ def test_killed_half_way_and_resumed_nothing_is_done_twice(run: Run, tree: Path)
     for index, content in enumerate((b"nothing", b"", (tree / "day2" / "a.mcap").read_bytes()[:900])):
         (many / f"broken{index}.mcap").write_bytes(content)
     out = tree.parent / "out"
-    process = subprocess.Popen(
-        batch_command("many", "--out", "out", "--jobs", "2"),
-        cwd=tree.parent,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    wait_until(lambda: results_are_there(out, 5))
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    with endless(many / "20"):
+        process = subprocess.Popen(
+            batch_command("many", "--out", "out", "--jobs", "2"),
+            cwd=tree.parent,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        wait_until(lambda: results_are_there(out, 5))
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
     before = {name: stamp for name, stamp in results(out).items() if not name.startswith(".")}
     assert 5 < len(before) < 41
     # A row more may be there, whose result is moved by the next run.
@@ -506,18 +553,19 @@ def test_a_full_disk_ends_the_batch_and_the_same_command_goes_on(run: Run, tree:
 def test_ctrl_c_keeps_what_is_finished(tree: Path) -> None:
     for index in range(40):
         shutil.copytree(tree / "day1" / "a", tree / "many" / f"{index}")
-    process = subprocess.Popen(
-        batch_command("in/many", "--out", "out", "--jobs", "1"),
-        cwd=tree.parent,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
     out = tree.parent / "out"
-    wait_until(lambda: results_are_there(out, 3))
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers get it too
-    _, err = process.communicate(timeout=30)
+    with endless(tree / "many" / "20"):
+        process = subprocess.Popen(
+            batch_command("in/many", "--out", "out", "--jobs", "1"),
+            cwd=tree.parent,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        wait_until(lambda: results_are_there(out, 3))
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers get it too
+        _, err = process.communicate(timeout=300)
     assert process.returncode == 130, err
     kept = rows(out)
     assert err == f"ropetrace: interrupted; {len(kept)} of 40 recordings are finished and kept in out\n"
@@ -540,7 +588,7 @@ with LocalCluster(host="127.0.0.1", **options) as cluster:
     cli.main()
 """
     process = subprocess.run(
-        [sys.executable, "-c", code], cwd=tree.parent, check=False, capture_output=True, text=True, timeout=100
+        [sys.executable, "-c", code], cwd=tree.parent, check=False, capture_output=True, text=True, timeout=300
     )
     assert process.returncode == 3, process.stderr
     assert run("batch", "in/**", "--out", "here", *ROPE)[0] == 3

@@ -18,7 +18,7 @@ from ropetrace.errors import OutputError, import_extra
 from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, NOTHING_FOUND, progress_bar
 
 if TYPE_CHECKING:
-    from ropetrace.batch import Outcome, ResultFolder
+    from ropetrace.batch_folder import Outcome, ResultFolder
     from ropetrace.config import RopeConfig
     from ropetrace.recordings.find import Found
 
@@ -48,7 +48,8 @@ class Batch:
     """Begin anew, in the place of the results that are finished."""
 
     def run(self) -> int:
-        from ropetrace.batch import ResultFolder, run_batch
+        from ropetrace.batch import run_batch
+        from ropetrace.batch_folder import ResultFolder
         from ropetrace.evaluation.runner import check_engine
         from ropetrace.recordings.find import find_recordings
 
@@ -97,7 +98,8 @@ class Batch:
                 raise OutputError(f"{self.out} is, or lies in, the recording {recording}: choose another folder")
 
     def _tasks(self, found: Found, config: RopeConfig) -> list[Any]:
-        from ropetrace.batch import SUMMARY, Task
+        from ropetrace.batch import Task
+        from ropetrace.batch_folder import SUMMARY
 
         part = self.part
         tasks = [
@@ -121,7 +123,7 @@ class Batch:
 
 def _tell(folder: ResultFolder, outcomes: list[Outcome], before: int) -> int:
     """Say what came of it; the exit code."""
-    from ropetrace.batch import SUMMARY
+    from ropetrace.batch_folder import SUMMARY
 
     failed = [outcome for outcome in outcomes if outcome.failed]
     damaged = [outcome for outcome in outcomes if outcome.error and not outcome.failed]

@@ -22,6 +22,10 @@ from ropetrace.evaluation.runner import end_with_parent, without_interrupt
 LONGEST_SILENCE = 120.0
 """A process that starts or works on a frame for longer hangs, seconds. The first frame may have to be compiled for."""
 
+_LONGEST_LOOK = 5.0
+"""Of the time between two looks at a process, so much counts as its silence, seconds: both may have been stopped, as by
+Ctrl-Z."""
+
 _TELL_EVERY = 1.0
 """Seconds between two signs of life at least, so that nobody is kept busy by them."""
 
@@ -45,7 +49,8 @@ class Worker:
             self._process.start()
         theirs.close()
         self._answer: Any = None
-        self._heard = 0.0
+        self._looked = 0.0
+        self._silence = 0.0
         self._before_first = 0.0
 
     def begin(self, function: Callable[..., Any], *arguments: Any, before_first: float = 0.0) -> None:
@@ -53,23 +58,27 @@ class Worker:
 
         Before the first such sign it may be silent for `before_first` seconds longer than later.
         """
-        self._answer, self._heard = None, time.monotonic()
+        self._answer = None
+        self._silence, self._looked = 0.0, time.monotonic()
         self._before_first = before_first
         with suppress(OSError):  # `is_done` sees that it died
             self.pipe.send((function, arguments))
 
     @property
     def is_done(self) -> bool:
-        """Whether the call has ended, or the process is lost."""
+        """Whether the call has ended, or the process is lost. To be asked again and again."""
+        now = time.monotonic()
+        self._silence += min(now - self._looked, _LONGEST_LOOK)
+        self._looked = now
         try:
             while self._answer is None and self.pipe.poll():
-                self._answer, self._heard = self.pipe.recv(), time.monotonic()
-                self._before_first = 0.0
+                self._answer = self.pipe.recv()
+                self._silence = self._before_first = 0.0
         except (OSError, EOFError):
             self._process.join(1)
             self._answer = WorkerLostError(f"its process was killed ({self._end()})")
         patience = LONGEST_SILENCE + self._before_first
-        if self._answer is None and time.monotonic() - self._heard > patience:
+        if self._answer is None and self._silence > patience:
             self._answer = WorkerLostError(f"it hung: no frame was finished for {patience:.0f} s")
         return self._answer is not None
 
