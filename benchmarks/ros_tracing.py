@@ -6,9 +6,9 @@
 This process is the camera and the arm, in real time: images and joints go out over Zenoh, joint commands come back. The
 rope sways in each of case study 2's winds for a ninth of the time; whenever the arm has come to the end it is put back
 and begins anew. Printed are the tracings and the errors of the tool; beside them those inside one process and without a
-clock, as `ropetrace reproduce case2` has them, with the tracker's own latency and with that of the nodes; the time from
-an image's stamp to the arrival of the first joint command that rests on it, and how much of it the simulated camera
-takes; and the memory and processor time of each node.
+clock, as `ropetrace reproduce case2` has them, but with the arm left in the image here and there, with the tracker's own
+latency and with that of the nodes; the time from an image's stamp to the arrival of the first joint command that rests
+on it, and how much of it the simulated camera takes; and the memory and processor time of each node.
 """
 
 from __future__ import annotations
@@ -189,8 +189,6 @@ def nodes(settings: Path, shared_memory: bool) -> Iterator[list[Process]]:
             command = [sys.executable, "-m", "ropetrace", "node", name, "--config", str(settings), "--router", ROUTER]
             if shared_memory:
                 command.append("--shared-memory")
-            if name == "track_deformable":
-                command.append("--self-filter")
             if name == "kinematic_system":
                 command += [f"--rate={CONTROL_RATE:g}", f"--response={RESPONSE:g}", f"--tool-turn={TOOL_TURN:g}"]
             started.append(Process(name, subprocess.Popen(command, stderr=subprocess.DEVNULL)))
@@ -267,7 +265,7 @@ def _line(wind: Wind) -> str:
 def _report(winds: list[Wind], condition: Condition, running: list[Process], used: list[float], took: float) -> None:
     every = np.concatenate([wind.latencies for wind in winds])
     p50, p99, p999 = np.percentile(every, [50, 99, 99.9])
-    settings = Case2Settings()
+    settings = Case2Settings(self_filter=False)
     own = measure_compute_time(condition, settings.as_case1()) / condition.speed
     delays = {f"in process, {own * 1e3:.1f} ms": own, f"in process, {p50:.1f} ms": p50 / 1e3 - 0.5 / CONTROL_RATE}
     rows = []

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytest.importorskip("mujoco")
 pytest.importorskip("pinocchio")
 
+from ropetrace import cli_trace, terminal
 from ropetrace.cli_trace import Trace
 from ropetrace.errors import ConfigError, OutputError
+from ropetrace.terminal import INTERRUPTED
+from ropetrace.trackers import SlicingTracker
+from ropetrace.types import Estimate
 
 
 def test_a_rope_at_rest_is_traced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -41,6 +47,27 @@ def test_a_tracing_that_fails_says_so(capsys: pytest.CaptureFixture[str]) -> Non
     assert "the tracing ended early" in capsys.readouterr().err
 
 
+def test_ctrl_c_waits_for_the_frame_that_is_worked_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told: list[int] = []
+    monkeypatch.setattr(terminal, "INTERRUPTS", told)
+    monkeypatch.setattr(cli_trace, "INTERRUPTS", told)
+    tracked = []
+
+    class Tracker(SlicingTracker):
+        def update(self, *given: Any) -> Estimate:
+            signal.raise_signal(signal.SIGINT)
+            estimate = super().update(*given)
+            tracked.append(estimate)
+            return estimate
+
+    monkeypatch.setattr("ropetrace.evaluation.case2.make_tracker", Tracker)
+    assert Trace(wind=0.0, view=False).run() == INTERRUPTED
+    assert len(tracked) == 1
+    assert capsys.readouterr().err == "ropetrace: interrupted\n"
+
+
 def test_the_view_is_an_rrd_file(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"\.rrd"):
         Trace(view=False, out=tmp_path / "trace.mcap").run()
@@ -57,7 +84,7 @@ def test_a_wind_that_cannot_be(tmp_path: Path) -> None:
 def test_the_command_is_known() -> None:
     result = subprocess.run(
         [sys.executable, "-m", "ropetrace", "trace", "--wind", "99", "--no-view"],
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert result.returncode == 2
     assert "99" in result.stderr

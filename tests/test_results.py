@@ -27,6 +27,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from result_examples import FIRST_STAMP, REASONS, cloud, estimate, estimates, frame, helix, motion, told
+from ropetrace import terminal
 from ropetrace.errors import MissingExtraError, OutputError
 from ropetrace.results import FORMATS, checkpoint, open_writer
 from ropetrace.results.base import (
@@ -519,17 +520,22 @@ def test_ctrl_c_at_any_moment_leaves_a_whole_file(tmp_path: Path, ending: str) -
     assert len(list(tmp_path.iterdir())) == 4
 
 
-def test_a_held_signal_comes_after_the_block() -> None:
+@pytest.mark.parametrize("number", terminal.ENDINGS)
+def test_a_held_signal_comes_after_the_block(number: signal.Signals) -> None:
     steps = []
 
-    def interrupted() -> None:
-        with uninterrupted():
-            signal.raise_signal(signal.SIGINT)
-            steps.append("done")
+    def end(*_: Any) -> None:
+        steps.append("ended")
 
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert steps == ["done"]
+    before = signal.signal(number, end)
+    try:
+        with uninterrupted():
+            signal.raise_signal(number)
+            steps.append("done")
+        assert steps == ["done", "ended"]
+        assert signal.getsignal(number) is end
+    finally:
+        signal.signal(number, before)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from result_examples import FIRST_STAMP, REASONS, cloud, estimate, frame, helix, motion, told
 from ropetrace.errors import OutputError
 from ropetrace.results import feed, live, open_writer
-from ropetrace.results.feed import Feed, stop_rerun
+from ropetrace.results.feed import Feed, RerunProcess, stop_rerun
 from ropetrace.results.live import LiveViewer
 from ropetrace.results.rrd import RrdWriter
 from ropetrace.types import Cloud, CloudFrame, Estimate, Frame, Status, Waypoints
@@ -150,6 +150,22 @@ def test_a_live_log_spares_its_viewers_and_tells_those_who_come_late(path: Path)
     # What is static is not dropped with the oldest.
     assert set(rows["/camera"]) == {None}
     assert "Pinhole:resolution" in rows["/camera"][None]
+
+
+@pytest.mark.parametrize("step_ns", [0, -33_333_333])
+def test_stamps_that_do_not_rise_do_not_freeze_a_live_log(path: Path, step_ns: int) -> None:
+    """The last of the four that rise is too early to be shown again."""
+    recording = new_recording()
+    recording.save(path)
+    log = RerunLog(recording, live=True)
+    stamps = [0, 33_333_333, 66_666_667, 100_000_000, *(100_000_000 + step_ns * index for index in range(1, 6))]
+    for index, stamp in enumerate(stamps):
+        item = dataclasses.replace(estimate(3), stamp_ns=FIRST_STAMP + stamp)
+        log.log(index, item, dataclasses.replace(frame(index), stamp_ns=FIRST_STAMP + stamp), cloud(index))
+    recording.disconnect()
+    rows = read_back(path)
+    assert set(rows["/rope/centerline"]) == {0, 2, 4, 5, 6, 7, 8}
+    assert {0, 5, 6, 7, 8} <= set(rows["/camera/depth"])
 
 
 def test_rings_are_as_wide_as_the_trackers_sigma_across_the_hidden_part(path: Path) -> None:
@@ -422,6 +438,38 @@ def test_the_ropes_of_a_frame_are_shown_together() -> None:
     assert fed.skipped == 8
 
 
+def test_frames_after_the_end_of_rerun_are_not_skipped_to_keep_up() -> None:
+    ended = threading.Event()
+
+    def end(*_: Any) -> None:
+        ended.set()
+        raise ValueError("nobody takes it")
+
+    fed = Feed("viewer", new_recording(), end, lambda: not ended.is_set())
+    fed.write(0, estimate(0))
+    assert ended.wait(PATIENCE)
+    for index in range(1, 20):
+        fed.write(index, estimate(index))
+    fed.stop(PATIENCE)
+    fed.write(20, estimate(20))
+    fed.write(21, estimate(21))
+    assert fed.skipped == 0
+
+
+def test_of_the_words_of_rerun_the_last_are_kept() -> None:
+    program = r"""
+for number in range(5000):
+    print("INFO", number)
+print("\x1b[31m ERROR\x1b[0m out of memory")
+print("  1: main")
+"""
+    process = RerunProcess([sys.executable, "-c", program])
+    assert process.wait(PATIENCE) == 0
+    assert process.trouble == "ERROR out of memory"
+    assert process.last_words == "1: main"
+    assert 2 <= len(process._lines) < 200
+
+
 def test_a_picture_that_fails_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
     told = []
     monkeypatch.setattr(warnings, "warn", lambda message, *_, **__: told.append(message))
@@ -479,11 +527,12 @@ def test_closing_the_window_does_not_stop_the_run(viewer: LiveViewer) -> None:
     viewer.write(0, estimate(0), frame(0), cloud(0))
     stop_rerun(viewer._app)
     assert not viewer.running
+    skipped = viewer.skipped
     for index in range(1, 20):
         viewer.write(index, estimate(index), frame(index), cloud(index))
     viewer.close()
     viewer.write(20, estimate(20))
-    assert viewer.skipped > 10
+    assert viewer.skipped == skipped
 
 
 def test_a_viewer_that_cannot_be_fed_leaves_no_window(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-import signal
+import os
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,7 +25,16 @@ from ropetrace.cli_trace import Trace
 from ropetrace.cli_track import Track, track
 from ropetrace.cli_tune import Tune
 from ropetrace.errors import ConfigError, OutputError, RopetraceError
-from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND
+from ropetrace.terminal import (
+    BAD_INPUT,
+    DAMAGED,
+    INTERRUPTED,
+    INTERRUPTS,
+    NOTHING_FOUND,
+    interrupt,
+    is_unread,
+    on_endings,
+)
 
 if TYPE_CHECKING:
     from ropetrace.recordings import Recording
@@ -167,31 +176,36 @@ def main() -> None:
         # A name that the terminal cannot show must not end a run that is done.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    signal.signal(signal.SIGTERM, _interrupt)
-    signal.signal(signal.SIGINT, _interrupt)
+    on_endings(interrupt)
     try:
-        code = command.run()
-    except RopetraceError as error:
-        print(f"ropetrace: {error}", file=sys.stderr)
-        code = BAD_INPUT
-    except KeyboardInterrupt:
-        print("ropetrace: interrupted", file=sys.stderr)
-        code = INTERRUPTED
-    except BrokenPipeError:
-        # Whoever reads our output has gone, as `ropetrace info | head` does.
-        sys.stderr.close()
-        code = 0
+        code = _run(command)
+    except OSError as error:
+        if not is_unread(error):
+            raise
+        # Nor is what Python would still say when it ends.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(nowhere, stream.fileno())
+        code = INTERRUPTED if INTERRUPTS else 0
     sys.exit(code)
 
 
-def _interrupt(number: int, frame: object) -> None:
-    INTERRUPTS.append(number)
-    raise KeyboardInterrupt
+def _run(command: Any) -> int:
+    try:
+        return int(command.run())
+    except RopetraceError as error:
+        print(f"ropetrace: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("ropetrace: interrupted", file=sys.stderr)
+        return INTERRUPTED
 
 
 def _spread(recording: Recording, part: Part, count: int) -> Iterator[Any]:
     """About `count` frames over the recording, or over the part of it that is asked for."""
-    available = part.limit or (None if recording.frame_count is None else recording.frame_count - part.start)
+    from ropetrace.recordings.base import frames_to_come
+
+    available = frames_to_come(recording, part.start, part.limit)
     every = 1 if available is None else max(available // count, 1)
     for index, event in enumerate(recording.frames(part.start, part.limit or count * every)):
         if index % every == 0:

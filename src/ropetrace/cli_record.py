@@ -14,8 +14,8 @@ import tyro
 from tyro.conf import OmitArgPrefixes, arg
 
 from ropetrace.cli_source import Source, TrackedRope
-from ropetrace.errors import ConfigError, OutputError, RopetraceError
-from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND, progress_bar
+from ropetrace.errors import OutputError, RopetraceError
+from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND, Interruption, progress_bar
 
 if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
@@ -45,6 +45,7 @@ class Record:
 
     def run(self) -> int:
         from ropetrace.recorder import BackgroundRecorder, Recorder
+        from ropetrace.recordings.base import check_color
         from ropetrace.results import check_outputs
         from ropetrace.trackers import make_tracker
 
@@ -55,7 +56,7 @@ class Record:
         config = self._config()
         recording = self.source.open()
         if config is not None:
-            _check_color(recording, config, self.source.part.start)
+            check_color(recording, config.asks_for_color, self.source.part.start)
         tracker = None if config is None else make_tracker(config)
         metadata = {} if config is None else {"config": config.resolved().to_toml()}
         recorder = Recorder(self.out, overwrite=self.overwrite, metadata=metadata)
@@ -113,9 +114,9 @@ class _Run:
         from ropetrace.tracking import Summary
 
         summary = Summary()
-        with self._bar() as bar, closing(self._events()) as events:
+        with self._bar() as bar, closing(self._events()) as events, Interruption() as interruption:
             try:
-                for _ in events:
+                for _ in interruption.ending_waits(events):
                     self._show(bar)
                     if self._should_stop():
                         break
@@ -129,9 +130,9 @@ class _Run:
         from ropetrace.motion import make_motion
         from ropetrace.tracking import track_recording
 
-        with self._bar() as bar, closing(self._events()) as events:
+        with self._bar() as bar, closing(self._events()) as events, Interruption() as interruption:
             return track_recording(
-                events,
+                interruption.ending_waits(events),
                 tracker,
                 [self],
                 motion=partial(make_motion, config.motion.method, config.diameter),
@@ -245,19 +246,12 @@ class _Run:
         return bool(INTERRUPTS) or self._recorder.failure is not None
 
     def _bar(self) -> Any:
-        count, part = self._recording.frame_count, self._part
-        left = None if count is None else max(count - part.start, 0)
-        return progress_bar(part.limit if left is None or (part.limit or left) < left else left, "frame")
+        from ropetrace.recordings.base import frames_to_come
+
+        return progress_bar(frames_to_come(self._recording, self._part.start, self._part.limit), "frame")
 
     def _show(self, bar: Any) -> None:
         """The frames that no kill can take any more; those in the queue are not among them."""
         if self._recorder.dropped:
             bar.set_postfix_str(f"{self._recorder.dropped} lost, the disk is too slow", refresh=False)
         bar.update(self._recorder.recorder.frames - bar.n)
-
-
-def _check_color(recording: Recording, config: RopeConfig, start: int) -> None:
-    from ropetrace.recordings.base import has_color
-
-    if config.asks_for_color and not has_color(recording, start):
-        raise ConfigError("a colour is asked for, but the source has none: leave out the colour, or record it")

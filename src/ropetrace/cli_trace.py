@@ -13,7 +13,7 @@ from tyro.conf import arg
 
 from ropetrace.cli_simulation import parse_duration
 from ropetrace.errors import OutputError, RopetraceError, import_extra
-from ropetrace.terminal import INTERRUPTED
+from ropetrace.terminal import INTERRUPTED, INTERRUPTS, Interruption
 
 FAILED = 1
 """Exit code of a tracing that did not reach the end of the rope."""
@@ -61,11 +61,13 @@ class Trace:
             paced = any(sink.live for sink in sinks)
             show = _Show(loop, [sink.write for sink in sinks], condition.speed if paced else None)
             try:
-                while loop.time < loop.begin:
-                    loop.see()
-                loop.on_frame = show
-                print("the arm traces it ...")
-                result = trace(loop)
+                with Interruption():
+                    loop.on_frame = _end_if_interrupted
+                    while loop.time < loop.begin:
+                        loop.see()
+                    loop.on_frame = show
+                    print("the arm traces it ...")
+                    result = trace(loop)
             except KeyboardInterrupt:
                 print("ropetrace: interrupted", file=sys.stderr)
                 return INTERRUPTED
@@ -115,6 +117,11 @@ class _Sink:
     live: bool
 
 
+def _end_if_interrupted(*_: Any) -> None:
+    if INTERRUPTS:
+        raise KeyboardInterrupt
+
+
 class _Show:
     """Takes each frame of a closed loop to the viewers, at the pace of real time if somebody looks."""
 
@@ -129,6 +136,7 @@ class _Show:
         self._start: tuple[float, float] | None = None
 
     def __call__(self, frame: Any, estimate: Any) -> None:
+        _end_if_interrupted()
         if not self._writers:
             return
         from ropetrace.tracking import in_world, with_motion

@@ -16,8 +16,8 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from ropetrace.cli_simulation import parse_duration
 from ropetrace.cli_source import Source, TrackedRope
-from ropetrace.errors import ConfigError, OutputError
-from ropetrace.terminal import DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND, Interruption, progress_bar
+from ropetrace.errors import ConfigError, OutputError, RopetraceError
+from ropetrace.terminal import BAD_INPUT, DAMAGED, INTERRUPTED, INTERRUPTS, NOTHING_FOUND, Interruption, progress_bar
 
 if TYPE_CHECKING:
     from ropetrace.config import RopeConfig
@@ -109,8 +109,8 @@ def track(
     from ropetrace.live import LiveRecording
     from ropetrace.motion import make_motion
     from ropetrace.picture import ContactSheet
-    from ropetrace.recordings.base import has_color
-    from ropetrace.results import check_outputs, open_writer
+    from ropetrace.recordings.base import check_color, frames_to_come
+    from ropetrace.results import GROWING, check_outputs, open_writer
     from ropetrace.trackers import make_tracker
     from ropetrace.tracking import track_recording
 
@@ -120,13 +120,16 @@ def track(
     live = recording if isinstance(recording, LiveRecording) else None
     sources = [*([] if live else [recording.path]), *inputs]
     check_outputs(outputs, overwrite, sources)
+    for path in outputs:
+        if live and limit is None and path.suffix.lower() in GROWING:
+            raise ConfigError(
+                f"{path}: {path.suffix} is kept in memory until the end, and a camera has none: take .csv or .mcap, "
+                "or give --limit"
+            )
     for path in [_settings_of(path) for path in outputs] + ([] if picture is None else [picture]):
         if path.exists() and (not overwrite or any(path.samefile(source) for source in sources)):
             raise OutputError(f"{path} exists already: choose another name or give --overwrite")
-    if config.asks_for_color and mask is None and not has_color(recording, start):
-        from ropetrace.tuning import NO_COLOR
-
-        raise ConfigError(NO_COLOR)
+    check_color(recording, config.asks_for_color and mask is None, start)
     tracker = make_tracker(config, None if mask is None else _mask(mask))
     resolved = config.resolved().to_toml()
     contact = None if picture is None else ContactSheet(picture)
@@ -154,11 +157,8 @@ def track(
         sinks += extra_sinks
         if live is not None:
             stack.callback(live.close)
-        total = None if recording.frame_count is None else max(recording.frame_count - start, 0)
-        if limit is not None:
-            total = limit if total is None else min(total, limit)
-        events = recording.frames(start, limit)
-        with _progress(total) as advance, Interruption() as interruption:
+        events = _Events(recording.frames(start, limit))
+        with _progress(frames_to_come(recording, start, limit)) as advance, Interruption() as interruption:
             summary = track_recording(
                 interruption.ending_waits(at_own_pace(events) if served and live is None else events),
                 tracker,
@@ -181,6 +181,9 @@ def track(
         print(f"written   {path} (settings: {path.name}.toml)")
     if viewer is not None and viewer.skipped:
         print(f"viewer    skipped {viewer.skipped} frames to keep up")
+    if events.fault is not None:
+        print(f"ropetrace: {events.fault}; what was tracked until then is written", file=sys.stderr)
+        return BAD_INPUT
     # A live source has no other end.
     if summary.interrupted and live is None and not served:
         print("ropetrace: interrupted; what was tracked until then is written", file=sys.stderr)
@@ -207,6 +210,25 @@ def pose_of(config: RopeConfig, frame: str) -> FloatArray | None:
     if config.camera_pose is None:
         raise ConfigError("--frame world needs camera_pose in the config")
     return config.world_from_camera()
+
+
+class _Events:
+    """The events of a source. A fault after the first of them is their end, and is kept."""
+
+    def __init__(self, events: Iterable[Event]) -> None:
+        self.fault: RopetraceError | None = None
+        self._events = events
+
+    def __iter__(self) -> Iterator[Event]:
+        any_came = False
+        try:
+            for event in self._events:
+                any_came = True
+                yield event
+        except RopetraceError as error:
+            if not any_came:
+                raise
+            self.fault = error
 
 
 def at_own_pace(events: Iterable[Event]) -> Iterator[Event]:

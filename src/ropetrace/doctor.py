@@ -15,6 +15,7 @@ from ropetrace.config import RopeConfig, format_color, parse_color
 from ropetrace.errors import FrameError
 from ropetrace.picture import captioned, depth_image, sheet
 from ropetrace.recordings import RecordingInfo, StreamInfo
+from ropetrace.recordings.base import NO_COLOR
 from ropetrace.segmentation import lab_from_rgb
 from ropetrace.trackers.slicing import SlicingTracker
 from ropetrace.types import (
@@ -124,8 +125,8 @@ def diagnose(
     if config.asks_for_color and lacks_color(first):
         diagnosis.add(
             Grade.BAD,
-            "a colour is asked for, but the recording has none",
-            "leave out the colour: all points then count as rope, so mask or box them",
+            NO_COLOR,
+            "without a colour all points count as rope: mask or box them",
         )
         return diagnosis
     diagnosis.picture = _gate_picture(good, config)

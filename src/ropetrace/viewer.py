@@ -143,6 +143,7 @@ class RerunLog:
         self._recording = recording
         self._live = live
         self._shown_ns: dict[str, int] = {}
+        self._asked_ns: dict[str, int] = {}
         self._pictured = True
         self._pose = np.eye(4) if frame_name == "camera" else frame_from_camera
         self._camera: Any = None
@@ -213,13 +214,15 @@ class RerunLog:
             self._recording.log("camera/image" if frame.color is None else "camera/depth", depth)
 
     def _is_due(self, what: str, stamp_ns: int, seconds: float) -> bool:
-        """Whether something may be shown again; in a live log, so long after the last time."""
-        if self._live:
-            since = stamp_ns - self._shown_ns.get(what, stamp_ns)
-            # A tenth is left to jitter: every second frame of 30 Hz makes 15. Stamps may run back.
-            if what in self._shown_ns and 0 <= since < 0.9e9 * seconds:
-                return False
-            self._shown_ns[what] = stamp_ns
+        """Whether something may be shown again; in a live log, so long after the last time, if the stamps rise."""
+        if not self._live:
+            return True
+        before = self._asked_ns.get(what)
+        self._asked_ns[what] = stamp_ns
+        # A tenth is left to jitter: every second frame of 30 Hz makes 15.
+        if before is not None and before < stamp_ns < self._shown_ns[what] + 0.9e9 * seconds:
+            return False
+        self._shown_ns[what] = stamp_ns
         return True
 
     def _log_camera(self, frame: RgbdFrame, step: int) -> None:

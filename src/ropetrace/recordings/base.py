@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from ropetrace.errors import FrameError, RecordingError
+from ropetrace.errors import ConfigError, FrameError, RecordingError
 from ropetrace.types import BadFrame, Event, Intrinsics, lacks_color
 
 DEFAULT_PAIR_GAP = 0.02
@@ -143,6 +143,23 @@ class Recording(Protocol):
             If nothing at all can be read.
         """
         ...
+
+
+def frames_to_come(recording: Recording, start: int = 0, limit: int | None = None) -> int | None:
+    """How many frames `recording.frames(start, limit)` gives, where that can be known without reading all of it."""
+    if recording.frame_count is None:
+        return limit
+    left = max(recording.frame_count - start, 0)
+    return left if limit is None else min(left, limit)
+
+
+NO_COLOR = "a colour is asked for, but the frames have none: leave out the colour, or record it"
+
+
+def check_color(recording: Recording, asks_for_color: bool, start: int = 0) -> None:
+    """Raise a ConfigError if a colour is asked for and the frames have none; `start` as that of `frames`."""
+    if asks_for_color and not has_color(recording, start):
+        raise ConfigError(NO_COLOR)
 
 
 def has_color(recording: Recording, start: int = 0) -> bool:

@@ -25,6 +25,9 @@ FORMATS = MappingProxyType(
 )
 """The endings that `open_writer` takes, each with the class that writes it."""
 
+GROWING = frozenset({".parquet", ".npz"})
+"""Those whose writer keeps all results in memory until the end, and writes them anew at each checkpoint."""
+
 NO_METADATA: Mapping[str, str] = MappingProxyType({})
 """What is kept beside the results where nothing is given."""
 

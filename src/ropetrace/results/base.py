@@ -16,6 +16,7 @@ from typing import BinaryIO, Protocol, Self
 import numpy as np
 
 from ropetrace.errors import OutputError
+from ropetrace.terminal import ENDINGS
 from ropetrace.types import Cloud, Estimate, FloatArray, Frame
 
 STATUS_COLUMNS = ("frame", "stamp_ns", "ahead_ns", "waypoint", "status")
@@ -154,14 +155,14 @@ def create(
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Hold back Ctrl-C and SIGTERM until the block is done, so that they never leave half a frame behind."""
+    """Hold back `ENDINGS` until the block is done, so that they never leave half a frame behind."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     held: list[tuple[int, FrameType | None]] = []
     previous = {
         number: signal.signal(number, lambda number, frame: held.append((number, frame)))
-        for number in (signal.SIGINT, signal.SIGTERM)
+        for number in ENDINGS
         if signal.getsignal(number) is not None
     }
     try:

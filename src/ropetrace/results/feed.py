@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
-import tempfile
 import threading
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,6 +23,18 @@ START_SECONDS = 20.0
 
 SEND_SECONDS = 5.0
 """How long Rerun may take for one frame before the next one is tried."""
+
+_KEPT_LINES = 100
+"""Of what Rerun says, the newest."""
+
+_LONGEST_LINE = 4096
+"""Bytes."""
+
+_COLORS = re.compile(r"\x1b\[[0-9;]*m")
+"""What paints the words on a terminal."""
+
+_TROUBLE = re.compile(r"\b(Error|ERROR|panicked|caught a signal)\b")
+"""In the line by which Rerun tells why it ends."""
 
 Address = tuple[str, int]
 
@@ -48,7 +61,7 @@ class Feed:
     Attributes
     ----------
     skipped : int
-        Frames that were not shown so far, or not with all their ropes.
+        Frames that were not shown so far, or not with all their ropes, while Rerun was there.
     """
 
     def __init__(
@@ -80,7 +93,7 @@ class Feed:
         """Show one rope in one frame, unless the next frame comes first."""
         with self._changed:
             if not self._slot or self._slot[0][0] != index:
-                self.skipped += bool(self._slot) or not self.running
+                self.skipped += bool(self._slot) and self.running and self._is_there()
                 self._slot = []
             self._slot.append((index, estimate, *pictures))
             self._changed.notify()
@@ -108,12 +121,59 @@ class Feed:
                     flushed = time.monotonic()
             except Exception as error:
                 # Whatever is wrong with a picture must not stop the tracking.
+                if not self._is_there():
+                    continue
                 with self._changed:
                     self.skipped += 1
-                if self._is_there() and not told:
+                if not told:
                     told = True
                     warnings.warn(f"the {self._name} misses frames: {error}", RuntimeWarning, stacklevel=2)
         self._recording.disconnect()
+
+
+class RerunProcess(subprocess.Popen[bytes]):
+    """Rerun, in a session of its own: Ctrl-C in the terminal is for us. Its last words are kept, and no others.
+
+    Parameters
+    ----------
+    command : sequence of str
+        The program and its arguments.
+    before : callable, optional
+        Called in the child before the program; must not touch what other threads hold.
+    """
+
+    def __init__(self, command: Sequence[str], before: Callable[[], None] | None = None) -> None:
+        super().__init__(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            preexec_fn=before,
+        )
+        self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
+        self._listener = threading.Thread(target=self._listen, name="words of rerun", daemon=True)
+        self._listener.start()
+
+    @property
+    def last_words(self) -> str:
+        """The last line that it said."""
+        self._listener.join(1.0)
+        return next(reversed(self._lines.copy()), "no message")
+
+    @property
+    def trouble(self) -> str:
+        """The last line that tells why it ended; empty if none does."""
+        self._listener.join(1.0)
+        return next((line for line in reversed(self._lines.copy()) if _TROUBLE.search(line)), "")
+
+    def _listen(self) -> None:
+        """Take all that it says, so that it never waits for us."""
+        assert self.stdout is not None
+        with self.stdout as words:
+            while piece := words.readline(_LONGEST_LINE):
+                if line := _COLORS.sub("", piece.decode(errors="replace")).strip():
+                    self._lines.append(line)
 
 
 def start_rerun(
@@ -123,48 +183,34 @@ def start_rerun(
     name: str,
     settle_seconds: float = 0.0,
     before: Callable[[], None] | None = None,
-) -> subprocess.Popen[bytes]:
+) -> RerunProcess:
     """Start Rerun, and return when it listens.
 
     Parameters
     ----------
-    command : sequence of str
-        The program and its arguments.
+    command, before
+        As for `RerunProcess`.
     addresses : sequence of (str, int)
         Where it must listen.
     name : str
         What it is, for people.
     settle_seconds : float
         How long it must then go on to be taken for started.
-    before : callable, optional
-        Called in the child before the program; must not touch what other threads hold.
 
     Raises
     ------
     OutputError
         If it ends, or does not listen in `START_SECONDS`; the message has its own words.
     """
-    with tempfile.TemporaryFile() as messages:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=messages,
-            stderr=messages,
-            # Ctrl-C in the terminal is for us.
-            start_new_session=True,
-            preexec_fn=before,  # noqa: PLW1509
-        )
-        try:
-            _wait(process, addresses, settle_seconds)
-        except TimeoutError:
-            stop_rerun(process)
-            messages.seek(0)
-            lines = [line for line in messages.read().decode(errors="replace").splitlines() if line.strip()]
-            reason = next((line for line in lines if "Error" in line), lines[-1] if lines else "no message")
-            raise OutputError(f"the {name} did not start ({reason.strip()})") from None
-        except BaseException:
-            stop_rerun(process)
-            raise
+    process = RerunProcess(command, before)
+    try:
+        _wait(process, addresses, settle_seconds)
+    except TimeoutError:
+        stop_rerun(process)
+        raise OutputError(f"the {name} did not start ({process.trouble or process.last_words})") from None
+    except BaseException:
+        stop_rerun(process)
+        raise
     return process
 
 

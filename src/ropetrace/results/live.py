@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 
 from ropetrace.errors import OutputError
 from ropetrace.results import NO_METADATA
 from ropetrace.results.base import Closing
-from ropetrace.results.feed import Feed, start_rerun, stop_rerun
+from ropetrace.results.feed import Feed, RerunProcess, start_rerun, stop_rerun
 from ropetrace.types import Cloud, Estimate, FloatArray, Frame
 from ropetrace.viewer import ArmView, RerunLog, default_blueprint, new_recording
 
@@ -76,7 +75,7 @@ class LiveViewer(Closing):
 
     @property
     def skipped(self) -> int:
-        """Frames that were not shown so far, or not with all their ropes."""
+        """Frames that were not shown so far, or not with all their ropes, while the window was open."""
         return self._feed.skipped
 
     @property
@@ -111,7 +110,7 @@ class LiveViewer(Closing):
                 self._feed.stop()
 
 
-def _start_app(arguments: Sequence[str]) -> tuple[subprocess.Popen[bytes], int]:
+def _start_app(arguments: Sequence[str]) -> tuple[RerunProcess, int]:
     """Start the app and wait until it listens; its process and its port."""
     screens = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
     if sys.platform == "linux" and not any(map(os.environ.get, screens)) and "--headless" not in arguments:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 
 from ropetrace.ros.saying import say
-from ropetrace.terminal import BAD_INPUT
+from ropetrace.terminal import BAD_INPUT, on_endings
 
 RESTART_AFTER = 1.0
 """Seconds."""
@@ -32,8 +32,7 @@ _PR_SET_PDEATHSIG = 1
 def told_to_stop() -> Callable[[], bool]:
     """Whether an end was asked for, as by Ctrl-C: a loop ends where it chooses, not in the middle of a message."""
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: stop.set())
+    on_endings(lambda *_: stop.set())
     return stop.is_set
 
 
