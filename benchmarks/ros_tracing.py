@@ -5,10 +5,10 @@
 
 This process is the camera and the arm, in real time: images and joints go out over Zenoh, joint commands come back. The
 rope sways in each of case study 2's winds for a ninth of the time; whenever the arm has come to the end it is put back
-and begins anew. Printed are the tracings and the errors of the tool; beside them those inside one process and without a
-clock, as `ropetrace reproduce case2` has them, but with the arm left in the image here and there, with the tracker's own
-latency and with that of the nodes; the time from an image's stamp to the arrival of the first joint command that rests
-on it, and how much of it the simulated camera takes; and the memory and processor time of each node.
+and begins anew. The arm is left in the image. Printed are the tracings and the errors of the tool; beside them those
+inside one process and without a clock, with the tracker's own latency and with that of the nodes; the time from an
+image's stamp to the arrival of the first joint command that rests on it, and how much of it the simulated camera takes;
+and the memory and processor time of each node.
 """
 
 from __future__ import annotations
