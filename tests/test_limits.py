@@ -359,6 +359,7 @@ WRONG: list[tuple[dict[str, Any], Reason, str]] = [
     ({"stamp": 1e9}, Reason.STALE, "at most 0.02 s in the future"),
     ({"now": 50.0, "stamp": 50.0}, Reason.CLOCK, "s since the last step"),
     ({"now": 5000.0, "stamp": 5000.0}, Reason.CLOCK, "s since the last step"),
+    ({"now": 1.7e308, "stamp": 1.7e308}, Reason.CLOCK, "s since the last step"),
     ({"measured": HOME + 10}, Reason.TRACKING, "joint 7 is at 10.79 rad"),
 ]
 
@@ -487,24 +488,48 @@ def test_commands_that_last_longer_or_shorter_than_a_period_are_counted_as_long_
     assert drift * np.abs(WISH).max() > rig.guard.options.max_tracking_error
 
 
+@pytest.mark.parametrize("unknown", [0, 3])
 @pytest.mark.parametrize(("held", "fault"), [(0.0, False), (0.4, False), (1.0, False), (1.6, True), (-0.6, True)])
-def test_after_a_gap_the_arm_may_be_anywhere_on_its_way(held: float, fault: bool) -> None:
+def test_after_a_gap_the_arm_may_be_anywhere_on_its_way(held: float, fault: bool, unknown: int) -> None:
+    """Also where its position is not known at first."""
     rig = Rig()
     rig.run(0.3)
     rig.now += 0.3
     rig.q = rig.q + held * 0.3 * rig.commands[-1]
+    for _ in range(unknown):
+        assert rig.step(measured=np.full(7, np.nan)).reason in (Reason.CLOCK, Reason.INPUT)
     command = rig.step()
-    assert command.reason is (Reason.TRACKING if fault else Reason.CLOCK)
-    rig.to_rest() if not fault else rig.run(0.5)
-    if not fault:
+    if fault:
+        assert command.reason is Reason.TRACKING
+    else:
+        assert command.reason is (None if unknown else Reason.CLOCK)
         np.testing.assert_allclose(rig.guard.position, rig.q, atol=1e-9)
-    # Of an arm whose position is unknown by then, nothing is counted.
-    unknown = Rig()
-    unknown.run(0.3)
-    before = unknown.guard.position
-    unknown.now += 0.3
-    unknown.step(measured=np.full(7, np.nan))
-    assert np.abs(unknown.guard.position - before).max() < 0.01
+        rig.to_rest()
+        np.testing.assert_allclose(rig.guard.position, rig.q, atol=1e-9)
+
+
+@pytest.mark.parametrize("clock", ["every fifth time is not known", "it has half the resolution"])
+def test_a_clock_that_is_bad_now_and_then_adds_up_to_nothing(clock: str) -> None:
+    rig = Rig()
+    rig.run(0.2)
+    for count in range(400):
+        coarse = rig.now + rig.period * (count % 2)
+        now = coarse if clock.startswith("it") else math.nan if count % 5 == 0 else rig.now + rig.period
+        rig.step(now=now, stamp=rig.now)
+    np.testing.assert_allclose(rig.guard.position, rig.q, atol=1.5 * rig.period * np.abs(WISH).max())
+
+
+def test_what_is_located_is_of_now() -> None:
+    """A step that comes three periods late, fast, at a low rate: the controller asks before it steps."""
+    rig = Rig(1 / 30)
+    rig.run(1.0, 2 * WISH)
+    rig.now += 3 * rig.period
+    rig.q = rig.q + 3 * rig.period * rig.commands[-1]
+    assert rig.guard.locate(rig.now + rig.period, rig.q) is not None
+    np.testing.assert_allclose(rig.guard.position, rig.q, atol=1e-9)
+    assert rig.step(2 * WISH).reason is None
+    np.testing.assert_allclose(rig.guard.position, rig.q, atol=1e-9)
+    assert rig.guard.locate(rig.now + rig.period, rig.q + 0.11) is None
 
 
 @pytest.mark.parametrize("side", [-1, 1])

@@ -181,12 +181,13 @@ def track(
         print(f"written   {path} (settings: {path.name}.toml)")
     if viewer is not None and viewer.skipped:
         print(f"viewer    skipped {viewer.skipped} frames to keep up")
+    kept = "; what was tracked until then is written" if outputs else ""
     if events.fault is not None:
-        print(f"ropetrace: {events.fault}; what was tracked until then is written", file=sys.stderr)
+        print(f"ropetrace: {events.fault}{kept}", file=sys.stderr)
         return BAD_INPUT
     # A live source has no other end.
     if summary.interrupted and live is None and not served:
-        print("ropetrace: interrupted; what was tracked until then is written", file=sys.stderr)
+        print(f"ropetrace: interrupted{kept}", file=sys.stderr)
         return INTERRUPTED
     if recording.problems:
         print("ropetrace: part of the recording was lost (see damage above)", file=sys.stderr)

@@ -125,7 +125,8 @@ class _Rerun:
         code = self._process.poll()
         if code is None:
             return None
-        words = self._process.trouble
+        # Who is killed for want of memory could say nothing of it; what it said before is about something else.
+        words = "" if code == -signal.SIGKILL else self._process.trouble
         return f"the view has ended: rerun stopped with code {code}" + (f" ({words})" if words else "")
 
     def end(self) -> None:

@@ -112,7 +112,7 @@ class TracingController:
         Control
             A command whatever comes in: where something is wrong it brakes, and says why.
         """
-        stamp, joints, time = self._stamp, self.guard.believable(q), finite_number(now)
+        stamp, joints, time = self._stamp, self.guard.locate(now, q), finite_number(now)
         if stamp is None or time is None or joints is None:
             # A bad time or position is a graver reason to the guard.
             return Control(None, self.guard.step(now, q, None, now if stamp is None else stamp, UNKNOWN))

@@ -40,6 +40,9 @@ _STILL = 1e-6
 _CLOCK_ROUNDING = 1e-9
 """By which sums of periods differ, s."""
 
+_LONGEST_GAP = 1e3
+"""In which an arm may have gone on, s."""
+
 _MOST_RAMP = 1000
 """Periods in which an acceleration can be taken back, at most: more is a wrong unit."""
 
@@ -138,8 +141,8 @@ class MotionGuard:
 
     The guard keeps the state that it has commanded. Its position is the sum of the velocities, each times the time
     until the next step, since the robot holds a command until another comes. Whether it did so in a gap above
-    `GuardOptions.max_gap` nobody knows: of the places where the joint can be by then, the one nearest to the measured
-    position counts. Else the measured position enters in three ways. A difference above
+    `GuardOptions.max_gap` nobody knows: of the places where the joint can be by then, the one nearest to the next
+    measured position counts. Else the measured position enters in three ways. A difference above
     `GuardOptions.max_tracking_error` is a fault. Room to each end of a joint's range is counted from the worse of
     commanded and measured position; noise can thus only make the guard more careful, and the commanded position of
     steps in time respects the limits on its own account. And a motion that starts after half a second of rest starts
@@ -234,13 +237,24 @@ class MotionGuard:
         if not self.at_rest:
             raise RopetraceError("the arm is still moving: go on calling step() until it is at rest, then reset()")
         self._state[0] = start
+        self._in_doubt = np.zeros(self._count)
         self._fault = ""
         self._last: float | None = None
+        self._counted_until = 0.0
         self._rest = 0
 
-    def believable(self, measured: Any) -> FloatArray | None:
-        """The measured position as an array, (n,), rad; None where `step` brakes at it, whatever else it is given."""
+    def locate(self, now: Any, measured: Any) -> FloatArray | None:
+        """The measured position as an array, (n,), rad; None where `step` brakes at it, whatever else it is given.
+
+        The last command is counted until now, so that `position` and `velocity_bounds` are of now, too.
+
+        Parameters
+        ----------
+        now, measured
+            As `step` will be given them.
+        """
         where = self._vector("", measured)[0]
+        self._count_until(finite_number(now), where)
         if where is None or not np.abs(where - self._state[0]).max() <= self.options.max_tracking_error:
             return None
         return where
@@ -288,7 +302,7 @@ class MotionGuard:
         Command
         """
         where, wrong = self._vector("measured position", measured)
-        self._learn_hold(finite_number(now), where)
+        self._count_until(finite_number(now), where)
         wish, vain = (None, "") if hold is not None else self._vector("desired velocity", desired)
         reason, text = self._objection(now, where, wrong, vain, stamp, hold)
         braking = reason is not None or where is None or wish is None
@@ -302,21 +316,27 @@ class MotionGuard:
             braking,
             settled,
         )
+        self._counted_until += self.period
         self._rest = 0 if moving else self._rest + 1
         return Command(self._state[1].copy(), reason, text)
 
-    def _learn_hold(self, now: float | None, where: FloatArray | None) -> None:
-        """The last command was counted as one period long: it lasted until now."""
-        if now is None or self._last is None or now <= self._last:
-            return
-        late = now - self._last - self.period
-        if abs(late) < _CLOCK_ROUNDING:
-            return
-        way = late * self._state[1]
-        if late >= (self.options.max_gap - 1) * self.period:
-            away = np.zeros(self._count) if where is None else where - self._state[0]
-            way = np.clip(away, np.minimum(way, 0), np.maximum(way, 0))
-        self._state[0] += way
+    def _count_until(self, now: float | None, where: FloatArray | None) -> None:
+        """Count the last command for as long as it lasted; what is in doubt, as the measured position has it."""
+        last = self._last
+        if now is not None and (last is None or now < last):
+            self._counted_until = now
+        elif now is not None and last is not None and now > last:
+            # No arm goes on for so long, and no sum overflows.
+            late = min(now - self._counted_until, _LONGEST_GAP)
+            if late >= (self.options.max_gap - 1) * self.period:
+                self._in_doubt += late * self._state[1]
+            elif abs(late) > _CLOCK_ROUNDING:
+                self._state[0] += late * self._state[1]
+            self._counted_until = now
+        if where is not None and self._in_doubt.any():
+            low, high = np.minimum(self._in_doubt, 0), np.maximum(self._in_doubt, 0)
+            self._state[0] += np.clip(where - self._state[0], low, high)
+            self._in_doubt[:] = 0
 
     def _objection(
         self, now: float, where: FloatArray | None, wrong: str, vain: str, stamp: float, hold: str | None

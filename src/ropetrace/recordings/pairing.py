@@ -5,7 +5,6 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise
 from statistics import median_low
 from typing import Generic, TypeVar
 
@@ -15,8 +14,8 @@ BUFFERED = 64
 BUFFERED_BYTES = 256 * 2**20
 """Bytes of each stream that wait for their partner at most."""
 
-_STEPS = 9
-"""Steps between colour images whose median is the usual one; half of them must be known."""
+_KNOWN = 11
+"""Colour images by whose stamps their usual distance is known; half of them must be there."""
 
 Depth = TypeVar("Depth")
 Color = TypeVar("Color")
@@ -45,30 +44,34 @@ class ColorReach:
 
     def __init__(self, max_gap_ns: int) -> None:
         self._max_gap_ns = max_gap_ns
-        self._last_ns: int | None = None
-        self._steps: deque[int] = deque(maxlen=_STEPS)
+        self._stamps: deque[int] = deque(maxlen=_KNOWN)
 
     def learn(self, stamp_ns: int) -> None:
         """A colour image has come."""
-        if self._last_ns is not None and stamp_ns > self._last_ns:
-            self._steps.append(stamp_ns - self._last_ns)
-        self._last_ns = stamp_ns
+        if self._stamps and stamp_ns < self._stamps[-1]:
+            self._stamps.clear()
+        self._stamps.append(stamp_ns)
 
     @property
     def reach_ns(self) -> int:
         """By the colour images that came last, nanoseconds."""
-        return reach_of(self._steps, self._max_gap_ns)
+        return reach_of(list(self._stamps), self._max_gap_ns)
 
 
-def reach_of(steps_ns: Sequence[int], max_gap_ns: int) -> int:
-    """Three quarters of the usual time between colour images, but `max_gap_ns` at most or where few are known."""
-    return min(max_gap_ns, 3 * median_low(steps_ns) // 4) if len(steps_ns) >= _STEPS // 2 else max_gap_ns
+def reach_of(stamps_ns: Sequence[int], max_gap_ns: int) -> int:
+    """Three quarters of the usual time between rising stamps, but `max_gap_ns` at most or where few are known.
+
+    Over two steps each, since stamps of arrival may come in pairs.
+    """
+    if len(stamps_ns) < _KNOWN // 2:
+        return max_gap_ns
+    step = median_low(later - one for one, later in zip(stamps_ns, stamps_ns[2:], strict=False)) // 2
+    return min(max_gap_ns, 3 * step // 4)
 
 
 def reach_around(stamps_ns: Sequence[int], index: int, max_gap_ns: int) -> int:
-    """`reach_of` the steps about one place in a rising sequence."""
-    near = stamps_ns[max(index - _STEPS // 2, 0) : index + _STEPS // 2 + 2]
-    return reach_of([later - one for one, later in pairwise(near) if later > one], max_gap_ns)
+    """`reach_of` the stamps about one place in a rising sequence."""
+    return reach_of(stamps_ns[max(index - _KNOWN // 2, 0) : index + _KNOWN // 2 + 1], max_gap_ns)
 
 
 def missing_color(gap_ns: int | None, max_gap_ns: int) -> str:

@@ -162,6 +162,7 @@ class KinematicSystem:
         self._reading: JointReading | None = None
         self._commanded = CommandedMotion(self.settings.rate, self.settings.response)
         self._heard = -math.inf
+        self._clock = math.nan
         self._fault = ""
         self._astray = False
 
@@ -214,6 +215,11 @@ class KinematicSystem:
             What was sent; None where nothing was, since there is no arm.
         """
         self._learn_joints()
+        clock = now - time.monotonic()
+        if abs(clock - self._clock) > self.period:
+            # It was set: how long the last command has lasted is not known by it.
+            self._commanded.forget()
+        self._clock = clock
         silent = time.monotonic() - self._heard
         if self._controller is not None and silent > ARM_GONE and self._controller.guard.at_rest and not self._astray:
             self._controller = None
