@@ -29,7 +29,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from ropetrace.control.arm import JointLimits
-from ropetrace.control.limits import MotionGuard, ToolLimits
+from ropetrace.control.limits import MotionGuard
+from ropetrace.control.tool_limits import ToolLimits
 from ropetrace.types import FloatArray
 from test_limits import FR3, HOME, PANDA, Rig, motions, violations
 

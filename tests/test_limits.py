@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ropetrace.control import limits
+from ropetrace.control import joint_steps, tool_limits
 from ropetrace.control.arm import JointLimits
-from ropetrace.control.limits import Command, GuardOptions, MotionGuard, Reason, ToolLimits
+from ropetrace.control.limits import Command, GuardOptions, MotionGuard, Reason
+from ropetrace.control.tool_limits import ToolLimits
 from ropetrace.errors import ConfigError, RopetraceError
 from ropetrace.types import FloatArray
 
@@ -155,7 +156,7 @@ def test_reach_equals_its_twin(jerk: float) -> None:
     rng = np.random.default_rng(11)
     for _ in range(40):
         v, a = rng.uniform(-1, 1) * 10 ** rng.uniform(-2, 0), rng.uniform(-10, 10)
-        assert limits._reach(v, a, 10.0, jerk, 0.01) == pytest.approx(slow_reach(v, a, 10.0, jerk, 0.01), abs=1e-9)
+        assert joint_steps._reach(v, a, 10.0, jerk, 0.01) == pytest.approx(slow_reach(v, a, 10.0, jerk, 0.01), abs=1e-9)
 
 
 @pytest.mark.parametrize("period", PERIODS)
@@ -416,7 +417,7 @@ def test_any_form_of_array_is_taken_without_compiling_again() -> None:
     Rig().step(WISH.astype(np.float32))
     Rig().step(np.arange(7))
     Rig().guard.velocity_bounds(fixed)
-    for kernel in (limits._move, limits._bound, limits._finite, limits._tool_share):
+    for kernel in (joint_steps.move, joint_steps.bound, joint_steps.all_finite, tool_limits._tool_share):
         assert len(kernel.signatures) == 1
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from ropetrace.control.arm import Arm
 from ropetrace.control.controller import Control, TracingController
-from ropetrace.control.limits import GuardOptions, ToolLimits
+from ropetrace.control.limits import GuardOptions
+from ropetrace.control.tool_limits import ToolLimits
 from ropetrace.control.tracing import TracingSettings
 from ropetrace.types import Estimate, FloatArray, Motion, Status, Waypoints, moved
 

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ropetrace.control.arm import Arm
-from ropetrace.control.limits import Command, GuardOptions, MotionGuard, ToolLimits, finite_number
+from ropetrace.control.limits import Command, GuardOptions, MotionGuard, finite_number
+from ropetrace.control.tool_limits import ToolLimits
 from ropetrace.control.tracing import RopeTracer, Step, TracingSettings
 from ropetrace.motion import MotionEstimator
 from ropetrace.types import Estimate, FloatArray, Motion, Status, moved

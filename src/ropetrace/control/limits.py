@@ -20,31 +20,22 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ropetrace.control.joint_steps import MOST_RAMP, all_finite, bound, move
 from ropetrace.errors import ConfigError, RopetraceError
 from ropetrace.types import FloatArray
 
 if TYPE_CHECKING:
     from ropetrace.control.arm import JointLimits
 
-_SLACK = 1e-4
-"""A wish that misses a bound of one joint by less, rad/s, meets it: solvers are not exact, and must not freeze."""
-
 _SETTLED = 0.5
 """Seconds of rest after which the arm has arrived where it was sent."""
-
-_STILL = 1e-6
-"""Speed towards a wall, m/s, that is round-off."""
 
 _CLOCK_ROUNDING = 1e-9
 """By which sums of periods differ, s."""
 
 _LONGEST_GAP = 1e3
 """In which an arm may have gone on, s."""
-
-_MOST_RAMP = 1000
-"""Periods in which an acceleration can be taken back, at most: more is a wrong unit."""
 
 
 class Reason(StrEnum):
@@ -188,17 +179,17 @@ class MotionGuard:
         )
         if (self._limits[0] >= self._limits[1]).any():
             raise ConfigError(f"guard: a margin of {self.options.margin:g} rad leaves a joint no range")
-        if (self._limits[3] > _MOST_RAMP * self._limits[4]).any():
+        if (self._limits[3] > MOST_RAMP * self._limits[4]).any():
             raise ConfigError(
                 f"guard: at a period of {period:g} s a joint's jerk limit is too low for its acceleration: "
-                f"it would need more than {_MOST_RAMP} periods to take it back"
+                f"it would need more than {MOST_RAMP} periods to take it back"
             )
         self._count = self._limits.shape[1]
         self._state = np.zeros((4, self._count))
         self._zero = np.zeros(self._count)
         self.reset(position)
         # Compiles the kernels now rather than in the first step.
-        _move(self._state, self._limits, self.period, self._state[0], self._zero, False, False)
+        move(self._state, self._limits, self.period, self._state[0], self._zero, False, False)
         self.velocity_bounds()
 
     @property
@@ -276,7 +267,7 @@ class MotionGuard:
         """
         known = None if measured is None else self._vector("", measured)[0]
         box = np.empty((6, self._count))
-        _bound(self._state, self._limits, self.period, self._state[0] if known is None else known, box)
+        bound(self._state, self._limits, self.period, self._state[0] if known is None else known, box)
         return box[0], box[1]
 
     def step(
@@ -307,7 +298,7 @@ class MotionGuard:
         reason, text = self._objection(now, where, wrong, vain, stamp, hold)
         braking = reason is not None or where is None or wish is None
         settled = self._rest * self.period > _SETTLED
-        moving = _move(
+        moving = move(
             self._state,
             self._limits,
             self.period,
@@ -386,87 +377,10 @@ class MotionGuard:
             return None, f"the {name} is no array of numbers"
         if array.shape != (self._count,):
             return None, f"the {name} has shape {array.shape}: expected ({self._count},), one number a joint"
-        if not _finite(array):
+        if not all_finite(array):
             joint = int(np.isfinite(array).argmin())
             return None, f"the {name} of joint {joint + 1} is {array[joint]}"
         return array, ""
-
-
-class ToolLimits:
-    """How fast the tool may go, and where: makes a wish for joint velocities shorter as a whole.
-
-    It acts on the wish, before the guard. What the guard makes of it keeps the joints' limits first: while it brakes or
-    changes direction, the tool may leave the line, be faster for a moment or pass a wall by a little. A wall that must
-    not be touched needs room in front of it, or a robot that watches it itself.
-
-    Parameters
-    ----------
-    linear, angular : float
-        Greatest speeds of the tool, m/s and rad/s. By default a Panda's.
-    low, high : (3,) float array
-        Corners of the box in the base's frame in which the tool's origin must stay, metres. By default without end.
-    deceleration : float
-        With which the tool comes to rest at a wall, m/s^2: less than the joints can do in any pose of the task.
-    period : float
-        Of the control loop, s.
-
-    Raises
-    ------
-    ConfigError
-        If a value is not positive, or the box is empty or no box.
-    """
-
-    def __init__(
-        self,
-        linear: float = 1.7,
-        angular: float = 2.5,
-        low: Any = (-math.inf, -math.inf, -math.inf),
-        high: Any = (math.inf, math.inf, math.inf),
-        deceleration: float = 1.0,
-        period: float = 1 / 240,
-    ) -> None:
-        for name, value in (
-            ("linear speed", linear),
-            ("angular speed", angular),
-            ("deceleration", deceleration),
-            ("period", period),
-        ):
-            if not 0 < value < math.inf:
-                raise ConfigError(f"tool limits: the {name} is {value}: it must be a finite number above 0")
-        box = np.array([low, high], dtype=np.float64)
-        if box.shape != (2, 3) or not (box[0] < box[1]).all():
-            raise ConfigError(f"tool limits: the box from {low} to {high} is empty, or not of three numbers each")
-        self._speeds = (float(linear), float(angular))
-        self._box = box
-        self._deceleration, self._period = float(deceleration), float(period)
-        self.scale(np.zeros((6, 1)), np.zeros(3), np.zeros(1))
-
-    def scale(self, jacobian: FloatArray, position: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Joint velocities in the same direction, with which the tool keeps its limits.
-
-        Parameters
-        ----------
-        jacobian : (6, n) float array
-            From joint velocities to the tool's velocity, m/s, and angular velocity, rad/s, along the base's axes.
-        position : (3,) float array
-            Of the tool in the base's frame, metres.
-        velocity : (n,) float array
-            Wanted of the joints, rad/s.
-
-        Returns
-        -------
-        (n,) float array
-            Zero if the tool is at a wall and the wish goes outward; one that goes inward or along it is always let
-            through. If anything is not finite or of a wrong shape, all NaN: the guard brakes at it and says so.
-        """
-        wish = np.array(velocity, dtype=np.float64, order="C")
-        mapping = np.array(jacobian, dtype=np.float64, order="C")
-        place = np.array(position, dtype=np.float64, order="C")
-        if wish.ndim != 1 or mapping.shape != (6, len(wish)) or place.shape != (3,):
-            return np.full(wish.shape, np.nan)
-        linear, angular = self._speeds
-        share = _tool_share(mapping, place, wish, linear, angular, self._box, self._deceleration, self._period)
-        return wish * share if math.isfinite(share) else np.full(wish.shape, np.nan)
 
 
 def finite_number(value: Any) -> float | None:
@@ -476,199 +390,3 @@ def finite_number(value: Any) -> float | None:
     except Exception:
         return None
     return number if math.isfinite(number) else None
-
-
-@njit(cache=True, nogil=True)
-def _finite(array: Any) -> bool:
-    for value in array:
-        if not np.isfinite(value):
-            return False
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _ramp(change: float, jerk: float) -> float:
-    """The greatest acceleration that, taken back by `jerk` a period, adds up to no more than `change`.
-
-    Inverse of ``(m + 1) a - jerk m (m + 1) / 2`` with ``m = floor(a / jerk)``. All three in units of rad/s^2: a change
-    of velocity is divided by the period, a jerk multiplied by it.
-    """
-    if change <= jerk:
-        return change
-    m = np.floor((np.sqrt(1 + 8 * change / jerk) - 1) / 2)
-    return (change + jerk * m * (m + 1) / 2) / (m + 1)
-
-
-@njit(cache=True, nogil=True)
-def _brake(v: float, a: float, acceleration: float, jerk: float, period: float) -> tuple[float, float]:
-    """The next velocity and acceleration of a joint that brakes: to rest exactly, as fast as the limits permit."""
-    speed = abs(v) / period
-    strongest = min(_ramp(speed, jerk), acceleration)
-    wanted = -math.copysign(strongest, v)
-    chosen = min(max(wanted, a - jerk), a + jerk)
-    if chosen == wanted and strongest == speed:
-        return 0.0, chosen
-    return v + period * chosen, chosen
-
-
-@njit(cache=True, nogil=True)
-def _reach(v: float, a: float, acceleration: float, jerk: float, period: float) -> float:
-    """How far up a joint gets from here while it brakes, rad: 0 if it only goes down."""
-    if v <= 0 and a - jerk <= _ramp(-v / period, jerk):
-        return 0.0
-    m = np.floor(acceleration / jerk)
-    whole_ramp = (m + 1) * acceleration - jerk * m * (m + 1) / 2
-    here = highest = 0.0
-    for _ in range(10 * _MOST_RAMP):
-        if v == 0 and a == 0:
-            return highest
-        v, a = _brake(v, a, acceleration, jerk, period)
-        here += period * v
-        highest = max(highest, here)
-        speed = abs(v) / period
-        if abs(a) == acceleration and v * a < 0 and speed > whole_ramp + acceleration:
-            steps = np.floor((speed - whole_ramp) / acceleration)
-            here += period * steps * (v + period * a * (steps + 1) / 2)
-            v += period * a * steps
-            highest = max(highest, here)
-    return np.inf
-
-
-@njit(cache=True, nogil=True)
-def _most(
-    v: float, a: float, room: float, top: float, acceleration: float, jerk: float, period: float
-) -> tuple[float, float, float]:
-    """The greatest next velocity of a joint from which it can still stop within the room above it.
-
-    Also the greatest that it may aim at, which is less than `top` only if the room is what limits it; and the room
-    itself, which is at least what braking needs.
-    """
-    braked, brake = _brake(v, a, acceleration, jerk, period)
-    room = max(room, _reach(v, a, acceleration, jerk, period))
-    high = max(min(a + jerk, acceleration, _ramp((top - v) / period, jerk)), brake)
-    best = v + period * high
-    if period * best + _reach(best, high, acceleration, jerk, period) <= room:
-        return best, top, room
-    low, best = brake, braked
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        tried = v + period * middle
-        if period * tried + _reach(tried, middle, acceleration, jerk, period) <= room:
-            low, best = middle, tried
-        else:
-            high = middle
-    return best, max(best, 0.0), room
-
-
-@njit(cache=True, nogil=True)
-def _bound(state: Any, limits: Any, period: float, measured: Any, box: Any) -> None:
-    """Rows of the box: least and greatest velocity of the next step, least and greatest to aim at, room on each side.
-
-    The room downward is positive, too.
-    """
-    for i in range(state.shape[1]):
-        q, v, a = state[0, i], state[1, i], state[2, i]
-        top, acceleration, jerk = limits[2, i], limits[3, i], limits[4, i]
-        room = min(q, measured[i]) - limits[0, i]
-        least, aim, room = _most(-v, -a, room, top, acceleration, jerk, period)
-        box[0, i], box[2, i], box[4, i] = -least, -aim, room
-        room = limits[1, i] - max(q, measured[i])
-        box[1, i], box[3, i], box[5, i] = _most(v, a, room, top, acceleration, jerk, period)
-
-
-@njit(cache=True, nogil=True)
-def _choose(state: Any, limits: Any, period: float, wish: Any, box: Any, chosen: Any) -> None:
-    """The velocities in the box that come closest to the wish, along a line."""
-    count = state.shape[1]
-    changed = False
-    share = 1.0
-    for i in range(count):
-        changed = changed or wish[i] != state[3, i]
-        share = min(share, limits[2, i] / max(abs(wish[i]), limits[2, i]))
-    inside = True
-    for i in range(count):
-        chosen[i] = wish[i] * share
-        if box[0, i] - _SLACK <= chosen[i] <= box[1, i] + _SLACK:
-            chosen[i] = min(max(chosen[i], box[0, i]), box[1, i])
-        else:
-            inside = False
-    if inside and changed:
-        return
-
-    share = 1.0
-    for i in range(count):
-        if chosen[i] > 0:
-            share = min(share, box[3, i] / chosen[i])
-        elif chosen[i] < 0:
-            share = min(share, box[2, i] / chosen[i])
-    most = 1.0
-    for i in range(count):
-        target = min(max(chosen[i] * share, box[2, i]), box[3, i])
-        chosen[i] = target
-        v, jerk = state[1, i], limits[4, i]
-        change = target - v
-        if change > 0:
-            most = min(most, min(box[1, i] - v, period * _ramp(change / period, jerk)) / change)
-        elif change < 0:
-            most = min(most, max(box[0, i] - v, -period * _ramp(-change / period, jerk)) / change)
-    for i in range(count):
-        if most < 1:
-            chosen[i] = state[1, i] + max(most, 0.0) * (chosen[i] - state[1, i])
-        chosen[i] = min(max(chosen[i], box[0, i]), box[1, i])
-
-
-@njit(cache=True, nogil=True)
-def _move(state: Any, limits: Any, period: float, measured: Any, wish: Any, braking: bool, settled: bool) -> bool:
-    """One step of the state; whether the joints move after it."""
-    count = state.shape[1]
-    box, chosen, wanted = np.empty((6, count)), np.empty(count), np.empty(count)
-    if not braking:
-        _bound(state, limits, period, measured, box)
-        _choose(state, limits, period, wish, box, chosen)
-        for i in range(count):
-            v, acceleration, jerk = chosen[i], limits[3, i], limits[4, i]
-            wanted[i] = (v - state[1, i]) / period
-            up = period * v + _reach(v, wanted[i], acceleration, jerk, period)
-            down = -period * v + _reach(-v, -wanted[i], acceleration, jerk, period)
-            braking = braking or not (up <= box[5, i] + 1e-12 and down <= box[4, i] + 1e-12)
-    moving = False
-    for i in range(count):
-        if braking:
-            chosen[i], wanted[i] = _brake(state[1, i], state[2, i], limits[3, i], limits[4, i], period)
-        moving = moving or chosen[i] != 0 or wanted[i] != 0
-    for i in range(count):
-        start = measured[i] if settled and moving else state[0, i]
-        state[0, i] = start + period * chosen[i]
-        state[1, i] = chosen[i]
-        state[2, i] = wanted[i]
-        state[3, i] = wish[i]
-    return moving
-
-
-@njit(cache=True, nogil=True)
-def _tool_share(
-    jacobian: Any,
-    position: Any,
-    velocity: Any,
-    linear: float,
-    angular: float,
-    box: Any,
-    deceleration: float,
-    period: float,
-) -> float:
-    """How much of the joint velocities keeps the tool within its limits, 0 to 1; NaN if anything is not finite."""
-    twist = np.zeros(6)
-    for row in range(6):
-        for i in range(len(velocity)):
-            twist[row] += jacobian[row, i] * velocity[i]
-    if not (_finite(twist) and _finite(position)):
-        return np.nan
-    share = linear / max(np.sqrt(twist[0] ** 2 + twist[1] ** 2 + twist[2] ** 2), linear)
-    share = min(share, angular / max(np.sqrt(twist[3] ** 2 + twist[4] ** 2 + twist[5] ** 2), angular))
-    for k in range(3):
-        room = box[1, k] - position[k] if twist[k] > 0 else position[k] - box[0, k]
-        if abs(twist[k]) > _STILL and room < np.inf:
-            step = deceleration * period
-            fastest = np.sqrt(step * step + 2 * deceleration * max(room, 0.0)) - step
-            share = min(share, fastest / max(abs(twist[k]), fastest))
-    return share

@@ -21,7 +21,8 @@ from ropetrace.config import RopeConfig, Vector
 from ropetrace.control.arm import Arm
 from ropetrace.control.controller import Control, TracingController
 from ropetrace.control.kinematics import manipulability
-from ropetrace.control.limits import Command, GuardOptions, Reason, ToolLimits
+from ropetrace.control.limits import Command, GuardOptions, Reason
+from ropetrace.control.tool_limits import ToolLimits
 from ropetrace.control.tracing import Phase, TracingSettings
 from ropetrace.errors import ConfigError
 from ropetrace.evaluation.case1 import Case1Settings, Condition, rope_config, scenario, schedule

@@ -12,7 +12,8 @@ import numpy as np
 
 from ropetrace.control.arm import Arm
 from ropetrace.control.controller import TracingController
-from ropetrace.control.limits import Command, GuardOptions, Reason, ToolLimits
+from ropetrace.control.limits import Command, GuardOptions, Reason
+from ropetrace.control.tool_limits import ToolLimits
 from ropetrace.control.tracing import Phase, TracingSettings
 from ropetrace.errors import ConfigError, FrameError
 from ropetrace.motion.filters import transition
